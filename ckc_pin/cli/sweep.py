@@ -9,9 +9,9 @@ import click
 
 from ckc_pin.cli import options
 from ckc_pin.cli.exits import STOPPED, interrupted
-from ckc_pin.cli.output import errors, print_json, print_table
-from ckc_pin.ensembles.ensemble import SweepResult, run_sweep, sweep_task
-from ckc_pin.ensembles.task import SweepTask
+from ckc_pin.cli.output import errors, print_json, print_summary
+from ckc_pin.ensembles.ensemble import SweepResult, load_sweep_task, run_sweep
+from ckc_pin.ensembles.members import SweepTask
 from ckc_pin.errors import InputError
 
 __all__ = ["sweep"]
@@ -61,14 +61,14 @@ def sweep(
     """
     if scheduler and workers:
         raise InputError("--workers and --scheduler: give one of them")
-    task = sweep_task(file)
+    task = load_sweep_task(file)
     unknown = [name for name in worst if name not in task.spec.outputs]
     if unknown:
         raise InputError(f"--worst {unknown[0]}: no such output; there are {', '.join(task.spec.outputs)}")
     if indices is not None:
-        from ckc_pin.ensembles.importance import laws_of
+        from ckc_pin.ensembles.sobol_indices import build_distributions
 
-        laws_of(task, indices)  # before anything is run
+        build_distributions(task, indices)  # before anything is run
     found = run_sweep(task, out, threads=threads, workers=workers, scheduler=scheduler, chunk=chunk)
     if found.repairs:
         errors().print(found.repairs)
@@ -82,29 +82,21 @@ def sweep(
         raise click.exceptions.Exit(STOPPED if found.status == "stopped" else interrupted(found.message))
 
 
-def _print(found: SweepResult, out: Path, as_json: bool) -> None:
-    keys = ("members", "done", "stopped", "failed", "wall_s", "rate")
-    summary = {key: getattr(found, key) for key in keys}
+def _print(result: SweepResult, out: Path, as_json: bool) -> None:
     if as_json:
-        print_json({"status": found.status, "message": found.message, **summary})
+        print_json(result.to_dict())
         return
-    from rich.table import Table
-
-    table = Table(show_header=False, box=None)
-    for key in keys:
-        value = summary[key]
-        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
-    print_table(table)
+    print_summary(result.summary())
     print(f"written to {out}")
 
 
 def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures: bool) -> None:
     """Write which variable matters, a row an output and variable, and draw it."""
     from ckc_pin.base.atomic_files import write_atomic
-    from ckc_pin.ensembles.importance import importance
+    from ckc_pin.ensembles.sobol_indices import compute_sobol_indices
     from ckc_pin.ensembles.store_layout import array_name
 
-    found = importance(task, count, threads)
+    found = compute_sobol_indices(task, count, threads)
     rows = ["output,variable,first_order,total_order"]
     for name in found["output"].to_numpy():
         of = found.sel(output=name)
@@ -123,9 +115,7 @@ def _weigh(task: SweepTask, count: int, threads: int | None, out: Path, figures:
 
 def _afterwards(found: SweepResult, out: Path, worst: tuple[str, ...], figures: bool) -> None:
     """Draw figures, and run the worst members again."""
-    import xarray as xr
-
-    results = xr.open_zarr(found.place, consolidated=False, decode_timedelta=False)
+    results = found.open_results()
     if figures:
         try:
             from ckc_pin.view.ensemble_figures import draw_ensemble
@@ -134,7 +124,7 @@ def _afterwards(found: SweepResult, out: Path, worst: tuple[str, ...], figures: 
         except InputError as error:  # matplotlib is an extra; the results are there
             errors().print(f"no figures: {error}")
     for name in worst:
-        from ckc_pin.ensembles.worst import save_worst
+        from ckc_pin.ensembles.ensemble import save_worst_members
 
-        for folder in save_worst(found.prepared, results, name, out):
+        for folder in save_worst_members(found.prepared, results, name, out):
             errors().print(f"ckc play {quote(str(folder))}")

@@ -1,4 +1,4 @@
-"""Checksums of the files of an ensemble's store, which tell damaged and missing files when the store is read."""
+"""Checksums of the files in an ensemble's store, which detect damaged and missing files."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ckc_pin.ensembles.members import PENDING, STATUS
 
 __all__ = ["CHECKSUMS", "NO_FILE", "ChunkChecksums", "checksum", "checksum_file", "describe_damage", "read_slices"]
 
-CHECKSUMS = "checksums"  # a group, because xarray takes every array beside the results for a result
+CHECKSUMS = "checksums"  # a group, because xarray reads every array in the results' group as a result
 TABLE = f"{CHECKSUMS}/chunks"
 CHECKSUM_BYTES = 16
 NO_FILE = bytes(CHECKSUM_BYTES)  # Zarr writes no file for a chunk that has only fill values
-UNREADABLE = b""  # differs from every checksum
+UNREADABLE = b""  # not equal to any checksum
 Statuses = NDArray[np.uint8]
 Rows = NDArray[np.uint8]
 
 
 def checksum(data: bytes) -> bytes:
-    """Return the checksum of some bytes."""
+    """Return the checksum of bytes."""
     return blake2b(data, digest_size=CHECKSUM_BYTES).digest()
 
 
@@ -40,15 +40,15 @@ def checksum_file(path: Path) -> bytes:
 
 
 def describe_damage(path: Path) -> str:
-    """Say how a file with a wrong checksum differs from a sound one."""
+    """Return whether a file with a wrong checksum is damaged or missing, as the predicate of a sentence."""
     return "is damaged" if path.exists() else "is missing"
 
 
 class ChunkChecksums:
-    """The table of checksums in a store: one row for each chunk of members, one entry for each array.
+    """Table of the checksums of chunks in a store: one row for each chunk of members, one entry for each array.
 
-    The entry of the first array, the status, is of the statuses themselves, because a chunk's row is written before
-    its status. The other entries are of the chunk's files.
+    The entry of the first array, the status, is a checksum of the statuses themselves, because a chunk's row is written
+    before its status. The other entries are checksums of the chunk's files.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ class ChunkChecksums:
     path : Path
         The group's folder.
     names : sequence of str
-        The arrays over members, the status first.
+        Names of the arrays over members, the status first.
     chunk : int
-        Members in a chunk.
+        Number of members in a chunk.
     """
 
     def __init__(self, group: Any, path: Path, names: Sequence[str], chunk: int) -> None:
@@ -87,29 +87,29 @@ class ChunkChecksums:
         """Return the row of a chunk from its statuses and from its files."""
         files = [checksum_file(self.path / self.key(k, column)) for column in range(1, len(self.names))]
         row = np.zeros((len(self.names), CHECKSUM_BYTES), np.uint8)
-        for entry, found in zip(row, [checksum(status.tobytes()), *files], strict=True):
-            entry[: len(found)] = np.frombuffer(found, np.uint8)
+        for entry, value in zip(row, [checksum(status.tobytes()), *files], strict=True):
+            entry[: len(value)] = np.frombuffer(value, np.uint8)
         return row
 
     def write(self, k: int, status: Statuses) -> None:
-        """Write the row of a chunk whose files are written."""
+        """Write the row of a chunk. Its files must have been written before."""
         self._table[k] = self.compute(k, status)
 
     def read(self) -> Rows:
-        """Return the table, with zeros in rows that are missing or unreadable."""
+        """Return the table, with zeros in missing and unreadable rows."""
         return np.concatenate(list(read_slices(self._table, 0, self._table.shape[0], 1)))
 
     def find_damage(self, statuses: Iterable[Statuses]) -> Iterator[tuple[int, str]]:
-        """Yield damaged chunks, each with a sentence about its first damaged file.
+        """Yield the indices of damaged chunks, each with a sentence about its first damaged file.
 
         Parameters
         ----------
         statuses : iterable of array
-            Of each chunk in turn; all pending where they cannot be read.
+            Statuses of each chunk; all pending if they cannot be read.
         """
         for k, (status, row) in enumerate(zip(statuses, self.read(), strict=True)):
             if (status == PENDING).all():
-                if row.any() or (self.path / self.key(k, 0)).exists():  # both are written when the chunk is finished
+                if row.any() or (self.path / self.key(k, 0)).exists():  # a pending chunk has neither
                     yield k, f"{self.key(k, 0)} {describe_damage(self.path / self.key(k, 0))}"
             elif not row.any():
                 yield k, f"{self.table_key(k)} {describe_damage(self.path / self.table_key(k))}"
@@ -120,7 +120,7 @@ class ChunkChecksums:
                     yield k, f"{key} {describe_damage(self.path / key)}"
 
     def add_missing_checksums(self, statuses: Iterable[Statuses]) -> Iterator[tuple[int, str]]:
-        """Write the rows of chunks that have none yet; yield chunks that cannot be read, as `find_damage` does.
+        """Write the rows of chunks without checksums; yield chunks that cannot be read, as `find_damage` does.
 
         Parameters
         ----------
@@ -136,23 +136,23 @@ class ChunkChecksums:
                 self.write(k, status)
 
     def _find_unreadable(self, k: int, status: Statuses) -> str:
-        """Return a file of a chunk that has no values, or an empty string; only messages may be without a file."""
+        """Return an unreadable file of a chunk, or an empty string. Only messages may have no file."""
         if (status >= len(STATUS)).any():
             return self.key(k, 0)
-        at = slice(k * self._chunk, (k + 1) * self._chunk)
+        members = slice(k * self._chunk, (k + 1) * self._chunk)
         for column, array in enumerate(self._arrays):
             key = self.key(k, column)
             try:
-                array[at]
-                sound = array.dtype.kind != "f" or (self.path / key).exists()
-            except Exception:  # whatever a damaged file makes Zarr's codecs raise
-                sound = False
-            if not sound:
+                array[members]
+                is_readable = array.dtype.kind != "f" or (self.path / key).exists()
+            except Exception:  # a damaged file may make Zarr's codecs raise anything
+                is_readable = False
+            if not is_readable:
                 return key
         return ""
 
     def remove_chunk(self, k: int) -> None:
-        """Remove the files of a chunk, its status first: its members are pending from then on."""
+        """Remove the files of a chunk, its status first, which makes its members pending."""
         keys = [self.key(k, column) for column in range(len(self.names))]
         for key in (*keys, self.table_key(k)):
             with suppress(FileNotFoundError, NotADirectoryError):
@@ -160,12 +160,12 @@ class ChunkChecksums:
 
 
 def read_slices(array: Any, first: int, end: int, step: int) -> Iterator[NDArray[Any]]:
-    """Read a part of an array at once, or chunk by chunk where that fails; unreadable chunks have fill values."""
+    """Yield a part of an array as a whole, or chunk by chunk if that fails; unreadable chunks have fill values."""
     try:
         yield array[first:end]
-    except Exception:  # whatever a damaged file makes Zarr's codecs raise
-        for at in range(first, end, step):
+    except Exception:  # a damaged file may make Zarr's codecs raise anything
+        for start in range(first, end, step):
             try:
-                yield array[at : min(at + step, end)]
-            except Exception:  # as above: this chunk is one of the damaged ones
-                yield np.full((min(step, end - at), *array.shape[1:]), array.fill_value, array.dtype)
+                yield array[start : min(start + step, end)]
+            except Exception:  # this chunk is damaged
+                yield np.full((min(step, end - start), *array.shape[1:]), array.fill_value, array.dtype)

@@ -1,4 +1,4 @@
-"""Chunks of members in processes and on machines: all of it Dask's, but for what one worker does with one chunk."""
+"""Run chunks of members in processes and on other machines with Dask."""
 
 from __future__ import annotations
 
@@ -14,90 +14,98 @@ from typing import Any
 
 from ckc_pin.base.atomic_files import temporary_folder
 from ckc_pin.base.interrupt import uninterrupted_thread
-from ckc_pin.ensembles.members import Chunk, Members
-from ckc_pin.ensembles.store import STAYS
-from ckc_pin.ensembles.task import SweepTask
+from ckc_pin.ensembles.members import Chunk, Members, SweepTask
+from ckc_pin.ensembles.store import RESUME_HINT
 from ckc_pin.errors import InputError
 
-__all__ = ["chunks_by", "client_of"]
+__all__ = ["CHUNKS_PER_WORKER", "compute_chunks", "connect"]
 
-WORKER = "Dask Worker process"  # how the names of Dask's worker processes begin
+WORKER_NAME = "Dask Worker process"  # prefix of the names of Dask's worker processes
 KILL_PERIOD_S = 0.02
-PATIENCE = 10.0  # s, for a scheduler to answer
-AHEAD = 3  # chunks a worker that are waiting or under way: none of them idles, and memory is bounded
+SCHEDULER_TIMEOUT_S = 10.0
+CHUNKS_PER_WORKER = 3  # submitted at a time, so that no worker idles and memory is bounded
 
-_members: dict[str, Members] = {}  # of this process: what was prepared last
+_members: dict[str, Members] = {}  # the members of the last task that this worker prepared, by the task's identity
 
 
-def work(task: SweepTask, first: int, end: int) -> Chunk:
-    """Run one chunk on a worker; what is prepared for a sweep is kept for its next chunk."""
+def _run_chunk(task: SweepTask, first: int, end: int) -> Chunk:
+    """Run one chunk on a worker. Prepared members are reused for the next chunk of the same sweep."""
     if task.identity not in _members:
         _members.clear()
-        _members[task.identity] = task.members(1)
-    return _members[task.identity].run(first, task.variables().values(first, end))
+        _members[task.identity] = task.prepare(1)
+    return _members[task.identity].run(first, task.variables.values(first, end))
 
 
 @contextmanager
-def client_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
-    """Connect to a scheduler, or start a cluster of processes on this machine, which nobody else can reach.
+def connect(scheduler: str | None, workers: int | None) -> Iterator[Any]:
+    """Connect to a scheduler, or start a cluster of processes that only this machine can reach.
+
+    Parameters
+    ----------
+    scheduler : str or None
+        Address of an existing scheduler.
+    workers : int or None
+        Number of processes to start without a scheduler.
+
+    Yields
+    ------
+    dask.distributed.Client
 
     Raises
     ------
     InputError
-        Dask is not installed; the scheduler does not answer.
+        Dask is not installed, or the scheduler does not answer.
     """
     try:
         import dask
         from dask.distributed import Client
     except ModuleNotFoundError:
-        says = (
-            "processes and machines are run by dask.distributed, which is not installed: pip install ckc_pin[cluster]"
-        )
-        raise InputError(says) from None
+        raise InputError(
+            "workers and schedulers need dask.distributed, which is not installed: pip install ckc_pin[cluster]"
+        ) from None
     if scheduler is None:
         with (
             temporary_folder() as folder,
             dask.config.set({"temporary-directory": str(folder)}),
-            _silenced("distributed"),  # of tasks that are cancelled and workers that are killed, by an interrupt
-            _local_cluster(workers) as client,
+            _silence("distributed"),  # it logs tasks that an interrupt cancels and workers that it kills
+            _start_cluster(workers) as client,
         ):
             yield client
         return
     try:
-        # no default: one that does not answer would be asked for all that the process computes by Dask afterwards
-        client = Client(scheduler, timeout=PATIENCE, set_as_default=False)  # type: ignore[no-untyped-call]
+        # It is not the default client, which would receive all later Dask computations of this process.
+        client = Client(scheduler, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
-            f"--scheduler {scheduler}: does not answer within {PATIENCE:g} s ({type(error).__name__}); start one with "
-            "`dask scheduler` and `dask worker ADDRESS`, or leave it out for processes on this machine"
+            f"--scheduler {scheduler}: does not answer within {SCHEDULER_TIMEOUT_S:g} s ({type(error).__name__}); "
+            "start one with `dask scheduler` and `dask worker ADDRESS`, or omit it for processes on this machine"
         ) from None
-    # they have tracebacks of a scheduler that is lost, of which a message tells
-    with _silenced("distributed", "distributed.client"), client:
+    # They log tracebacks if the scheduler is lost, which an error message reports anyway.
+    with _silence("distributed", "distributed.client"), client:
         yield client
 
 
 @contextmanager
-def _silenced(*names: str) -> Iterator[None]:
-    """Show nothing of logs below CRITICAL."""
+def _silence(*names: str) -> Iterator[None]:
+    """Suppress log records below CRITICAL of some loggers."""
     logs = [logging.getLogger(name) for name in names]
-    before = [log.level for log in logs]
+    levels = [log.level for log in logs]
     for log in logs:
         log.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for log, level in zip(logs, before, strict=True):
+        for log, level in zip(logs, levels, strict=True):
             log.setLevel(level)
 
 
 @contextmanager
-def _local_cluster(workers: int | None) -> Iterator[Any]:
+def _start_cluster(workers: int | None) -> Iterator[Any]:
     """Start a cluster of processes on this machine, and connect to it; an interrupt kills the processes.
 
-    Dask cannot close a cluster whose construction was
-    interrupted, so the cluster is constructed in another thread.
+    Dask cannot close a cluster whose construction was interrupted, so the cluster is constructed in another thread.
     """
-    others = set(active_children())
+    children_before = set(active_children())
     with uninterrupted_thread(_block_sigint) as pool:
         starting = pool.submit(_start, workers)
         try:
@@ -105,25 +113,25 @@ def _local_cluster(workers: int | None) -> Iterator[Any]:
                 _, client = starting.result()
             except (OSError, RuntimeError) as error:
                 raise InputError(
-                    f"workers: {workers} processes cannot be started ({error}); a script of yours calls ensemble below "
-                    '`if __name__ == "__main__":`, since each process reads the script again'
+                    f"workers: {workers} processes cannot be started ({error}); a script must call ensemble below "
+                    '`if __name__ == "__main__":`, because each process imports the script'
                 ) from None
             yield client
         except BaseException:
             closing = pool.submit(_close, starting)
             while not closing.done():
-                _kill_workers(others)  # again and again: Dask starts a killed worker anew until the cluster is closing
+                _kill_workers(children_before)  # repeatedly, because Dask restarts workers until the cluster closes
                 wait([closing], KILL_PERIOD_S)
             raise
         pool.submit(_close, starting).result()
 
 
 def _block_sigint() -> None:
-    """Block SIGINT in this thread, and by that in all threads and processes that are started from it.
+    """Block SIGINT in this thread, and so in all threads and processes that are started from it.
 
-    Ctrl-C sends SIGINT to the workers, too. They are killed by the process that started them.
+    Ctrl-C sends SIGINT to the workers, too. The process that started them kills them.
     """
-    resource_tracker.ensure_running()  # which unblocks SIGINT when `multiprocessing` starts it later
+    resource_tracker.ensure_running()  # `multiprocessing` would start it later, which unblocks SIGINT
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
@@ -136,8 +144,8 @@ def _start(workers: int | None) -> tuple[Any, Any]:
         threads_per_worker=1,
         processes=True,
         host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        scheduler_kwargs={"dashboard": False},  # any port: 8787 may be taken
+        dashboard_address="127.0.0.1:0",  # any free port, because 8787 may be in use
+        scheduler_kwargs={"dashboard": False},
         silence_logs=logging.CRITICAL,
     )
     try:
@@ -155,47 +163,58 @@ def _close(starting: Future[tuple[Any, Any]]) -> None:
         cluster.close()
 
 
-def _kill_workers(others: Set[BaseProcess]) -> None:
+def _kill_workers(children_before: Set[BaseProcess]) -> None:
     """Kill the processes of a cluster, which would otherwise finish their chunks before they end.
 
     Parameters
     ----------
-    others : set of processes
+    children_before : set of processes
         Child processes from before the cluster.
     """
-    for process in set(active_children()) - others:
-        if process.name.startswith(WORKER):
+    for process in set(active_children()) - children_before:
+        if process.name.startswith(WORKER_NAME):
             process.kill()
 
 
-def chunks_by(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
-    """Yield chunks as workers finish them, in whatever order.
+def compute_chunks(client: Any, task: SweepTask, pending: Iterable[tuple[int, int]], workers: int) -> Iterator[Chunk]:
+    """Yield the results of pending chunks in the order in which workers finish them.
+
+    Parameters
+    ----------
+    client : dask.distributed.Client
+    task : SweepTask
+    pending : iterable of (int, int)
+        First and end of the members of each chunk.
+    workers : int
+        Number of workers.
 
     Raises
     ------
     InputError
-        A chunk that its workers cannot finish: those that died, or what it raised. Others that are under way are lost.
+        Workers raised an error or died repeatedly, or the scheduler is lost. Chunks that are not finished are lost.
     """
     from dask.distributed import as_completed
     from distributed.client import FutureCancelledError
     from distributed.comm.core import CommClosedError
 
-    todo = iter(pending)
+    remaining = iter(pending)
 
     def submit(count: int) -> list[Any]:
         return [
-            client.submit(work, task, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
-            for first, end in islice(todo, count)
+            client.submit(_run_chunk, task, first, end, pure=False, key=f"{task.identity[:16]}-{first}", retries=2)
+            for first, end in islice(remaining, count)
         ]
 
-    running = as_completed(submit(AHEAD * workers), loop=client.loop)  # type: ignore[no-untyped-call]
+    running = as_completed(submit(CHUNKS_PER_WORKER * workers), loop=client.loop)  # type: ignore[no-untyped-call]
     for future in running:
         try:
             chunk = future.result()
         except (FutureCancelledError, CommClosedError) as error:
-            raise InputError(f"the scheduler is lost, or was restarted ({type(error).__name__}); {STAYS}") from None
-        except Exception as error:  # what a worker raised, or that workers died over it
-            raise InputError(f"a worker failed: {type(error).__name__}: {error}; {STAYS}") from None
-        for more in submit(1):
-            running.add(more)  # type: ignore[no-untyped-call]
+            raise InputError(
+                f"the scheduler is lost, or was restarted ({type(error).__name__}); {RESUME_HINT}"
+            ) from None
+        except Exception as error:  # a worker may raise anything, or have died
+            raise InputError(f"a worker failed: {type(error).__name__}: {error}; {RESUME_HINT}") from None
+        for new in submit(1):
+            running.add(new)  # type: ignore[no-untyped-call]
         yield chunk

@@ -1,30 +1,33 @@
-"""The members of a sweep: prepared once, run in threads without the interpreter, or one by one where that cannot be.
+"""Members of a sweep: prepared once, and run in native threads as a batch or one by one.
 
-What cannot be put into a loop that is there already (another controller, another solver, a configuration that needs
-more than following its loops from the scene's) is prepared as a run of its own. So is every member whose motion does
-not end as it should, or does not begin: the run says why.
+A batch takes members that differ in parameters and starts only. Other members are prepared as separate runs: those that
+differ in the controller or the solver, and those whose loops cannot be closed by continuation from the scene's start.
+Members whose motion does not begin or end regularly are run again separately, because a run gives the reason.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from hashlib import sha256
 from pathlib import Path
 from threading import Event
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.base.interrupt import interrupt_again
+from ckc_pin.base.sources import Sources
+from ckc_pin.codegen.arguments import present
 from ckc_pin.codegen.library import Library, compile_terms, explain_too_large, find_compiled_terms
-from ckc_pin.ensembles.member_numbers import MemberNumbers
-from ckc_pin.ensembles.names import check_names
 from ckc_pin.ensembles.outputs import Function, Outputs, Recorded
-from ckc_pin.ensembles.spec import OutputSpec
+from ckc_pin.ensembles.spec import OutputSpec, SweepSpec
+from ckc_pin.ensembles.variables import Variables, check_variable_names
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.parameters import is_parameter
@@ -37,19 +40,86 @@ from ckc_pin.scene.initial import find_branch
 from ckc_pin.scene.parts import rebuild_scene_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
 
-__all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "Members"]
+__all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "MemberNumbers", "Members", "SweepTask"]
 
 PENDING, DONE, STOPPED, FAILED = range(4)
 Statuses = NDArray[np.uint8]
 STATUS = ("pending", "done", "stopped", "failed")
-WORTH = 1_000_000  # right-hand sides a coordinate, from which terms are compiled for a sweep
+MIN_RHS_TO_COMPILE = 1_000_000  # right-hand sides for each coordinate, from which compiling terms saves time
 END, EVENT = "end", "event"
-MAX_INTEGER = 2.0**63  # the integers that a scene takes
+MAX_INTEGER = 2.0**63  # of an integer in a scene
+BATCHED_NUMBERS = {
+    "gravity", "offset", "mass", "centre", "inertia", "point", "end", "length", "constant", "joint_stiffness",
+    "joint_rest", "joint_damping", "stiffness", "rest_length", "damping",
+}  # fmt: skip
+DERIVED_NUMBERS = {"moment", "origin_inertia"}  # follow from mass, centre and inertia
+
+
+@dataclass(frozen=True)
+class SweepTask:
+    """Serializable description of a sweep, with which a worker process can prepare and run its members.
+
+    Attributes
+    ----------
+    spec : SweepSpec
+    name : str
+        Name of the sweep in messages.
+    scene : str or Path
+    folder : Path or None
+        Folder of the files of values.
+    functions : dict of str to callable
+        Outputs that are functions of a `Run`.
+    terms : str or None
+        "generated" or "pinocchio" if that is decided; it is the same on every machine.
+    """
+
+    spec: SweepSpec
+    name: str
+    scene: str | Path
+    folder: Path | None
+    functions: Mapping[str, Function] = field(default_factory=dict)
+    terms: str | None = None
+
+    def prepare(self, threads: int) -> Members:
+        """Prepare the members for a number of threads."""
+        overrides = dict(self.spec.overrides)
+        if self.terms is not None:
+            overrides["solver.terms"] = self.terms
+        outputs = {**self.spec.outputs, **self.functions}
+        return Members(self.scene, overrides, tuple(self.spec.variables), outputs, self.variables.count, threads)
+
+    @cached_property
+    def variables(self) -> Variables:
+        """Variables and their values."""
+        return Variables(self.spec, Sources(self.name, self.folder))
+
+    @cached_property
+    def identity(self) -> str:
+        """Hash of everything that the task computes."""
+        functions = sorted(
+            (name, getattr(f, "__qualname__", type(f).__qualname__)) for name, f in self.functions.items()
+        )
+        content = (msgspec.to_builtins(self.spec), str(self.scene), str(self.folder), functions, self.terms)
+        return sha256(msgspec.json.encode(content, order="deterministic")).hexdigest()
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """What came of some members: values of the variables, how each ended and why, outputs, work done."""
+    """Results of consecutive members.
+
+    Attributes
+    ----------
+    first : int
+        The first member.
+    values : (members, variables) array
+    status : (members,) array
+        Indices into `STATUS`.
+    message : list of str
+        Why a member stopped or failed; empty for others.
+    outputs : dict of str to (members, ...) array
+    rhs : int
+        Right-hand sides of all members.
+    """
 
     first: int
     values: Array
@@ -60,25 +130,25 @@ class Chunk:
 
 
 class Members:
-    """A scene that is run many times with other numbers.
+    """A scene that is run many times with different values of its variables.
 
     Parameters
     ----------
     scene : str or Path
     overrides : mapping
-        Of the scene, for all members.
+        Overrides of the scene, for all members.
     names : sequence of str
         The variables.
     outputs : mapping
-        As of `Outputs`.
+        As in `Outputs`.
     count : int
-        Members, by which it is known whether compiling terms repays.
+        Number of members, which decides whether compiling terms saves time.
     threads : int
 
     Raises
     ------
     CkcError
-        The scene itself cannot be run; unknown variables or outputs.
+        The scene cannot be run, or a variable or output is unknown.
     """
 
     def __init__(
@@ -95,45 +165,51 @@ class Members:
         self.scene: Scene = load_scene(scene, overrides)
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
-        self._vectors = check_names(scene, self._overrides, self.scene, self.mechanism, names)
-        self._outputs = outputs
+        self._vectors = check_variable_names(scene, self._overrides, self.scene, self.mechanism, names)
+        self._output_specs = outputs
         self.outputs = Outputs(outputs, self.ready)
-        self._require_one_time()
+        self._require_equal_instants()
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
         parameters = ParameterMap(
             self.mechanism, self.scene.spec.parameters, partial(rebuild_scene_mechanism, self.scene)
         )
         self._numbers = MemberNumbers(parameters, [names[k] for k in self._parameters])
-        self._library = self._terms(count)
+        self._library = self._select_library(count)
         self.terms = "pinocchio" if self._library is None else "generated"
         self._overrides["solver.terms"] = self.terms
-        self.shapes = self._shapes()
-        self.batched = self._can_be_batched()
+        self.shapes = self._find_shapes()
+        self.is_batched = self._can_be_batched()
         self._batch: Any = None
 
     # --- running ---------------------------------------------------------------------------------
 
     def run(self, first: int, values: Array) -> Chunk:
-        """Run members by the values of their variables, (members, variables).
+        """Run members and return their results.
+
+        Parameters
+        ----------
+        first : int
+            The first member.
+        values : (members, variables) array
+            Values of the variables.
 
         Raises
         ------
         KeyboardInterrupt
-            Nothing of the chunk is kept.
+            All results of the chunk are lost.
         """
-        count = len(values)
-        width, T = self.ready.loop.width, len(self.instants)
+        count, instants = len(values), len(self.instants)
         recorded = Recorded(
-            np.full((count, width), np.nan),
-            np.full((count, len(self.outputs.columns), T), np.nan),
-            np.full((count, len(self.ready.events)), np.nan),
+            last_row=np.full((count, self.ready.loop.width), np.nan),
+            series=np.full((count, len(self.outputs.columns), instants), np.nan),
+            event_times=np.full((count, len(self.ready.events)), np.nan),
         )
         status, message = np.full(count, PENDING, np.uint8), [""] * count
-        rhs = self._run_batch(values, recorded, status, message) if self.batched else 0
+        rhs = self._run_batch(values, recorded, status, message) if self.is_batched else 0
         outputs = self.outputs.compute(recorded)
         for name in self.outputs.functions:
             outputs[name] = np.full((count, *self.shapes[name][1]), np.nan)
-        rhs += self._run_singly(np.flatnonzero(status == PENDING), values, status, message, outputs)
+        rhs += self._run_separately(np.flatnonzero(status == PENDING), values, status, message, outputs)
         return Chunk(first, values, status, message, outputs, rhs)
 
     def overrides_of(self, values: Array) -> dict[str, Any]:
@@ -141,98 +217,105 @@ class Members:
         overrides = dict(self._overrides)
         for name, value in zip(self.names, values, strict=True):
             vector = self._vectors.get(name)
-            if vector is not None:  # the scene gives it whole
-                of, at = vector
-                whole = list(overrides.get(of, self.scene.spec.parameters[of]))
-                whole[at] = float(value)
-                overrides[of] = whole
+            if vector is not None:  # the scene gives all three components
+                vector_name, axis = vector
+                components = list(overrides.get(vector_name, self.scene.spec.parameters[vector_name]))
+                components[axis] = float(value)
+                overrides[vector_name] = components
             else:
-                whole_number = float(value).is_integer() and abs(value) < MAX_INTEGER and not is_parameter(name)
-                overrides[name] = int(value) if whole_number else float(value)
+                is_integer = float(value).is_integer() and abs(value) < MAX_INTEGER and not is_parameter(name)
+                overrides[name] = int(value) if is_integer else float(value)
         return overrides
 
     @property
     def instants(self) -> Array:
-        """When members are looked at, s."""
-        return self.ready.instants if self.outputs.whole else self.ready.instants[-1:]
+        """Instants at which members are recorded, s."""
+        return self.ready.instants if self.outputs.needs_series else self.ready.instants[-1:]
 
     @property
     def units(self) -> dict[str, tuple[str, ...]]:
-        """The unit of each variable, and of each component of each output that is no function, by name."""
-        of_variables = {name: (key_unit(self.mechanism, name),) for name in self.names}
-        return of_variables | {name: output.units for name, output in self.outputs.outputs.items()}
+        """Units of each variable, and of the components of each output that is not a function, by name."""
+        variable_units = {name: (key_unit(self.mechanism, name),) for name in self.names}
+        return variable_units | {name: output.units for name, output in self.outputs.outputs.items()}
+
+    def count_rhs(self) -> int:
+        """Run the scene itself, and return its number of right-hand sides."""
+        try:
+            _, status, message = record_rows(self.ready)
+        except CkcError:
+            return 0
+        if status == "interrupted":
+            raise interrupt_again(message)
+        return int(self.ready.loop.stats()["rhs"])
 
     def _run_batch(self, values: Array, recorded: Recorded, status: Statuses, message: list[str]) -> int:
+        """Run the members that a batch can take; enter their results, and return their right-hand sides."""
         if self._batch is None:
-            _, *others = self.ready.tables  # the scene's own terms may be without the numbers that vary from zero
+            _, *tables = self.ready.tables  # the scene's compiled terms may lack parameters that are zero in the scene
             core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
-            self._batch = _core.Batch(core, *others, self.mechanism.tolerance, self._threads)
-        found, sound = self._numbers.evaluate(values[:, self._parameters])
-        chosen = np.flatnonzero(sound)
-        count = len(chosen)
+            self._batch = _core.Batch(core, *tables, self.mechanism.tolerance, self._threads)
+        numbers, is_physical = self._numbers.evaluate(values[:, self._parameters])
+        batched = np.flatnonzero(is_physical)
+        count = len(batched)
         if not count:
             return 0
-        varied = [(name, x[chosen].reshape(count, -1)) for name, x in found.items()]
-        if found and self._library is not None:
-            varied.append(("written", self._numbers.arguments(found, len(values))[chosen]))
-        q, q_dot = self._starts(values[chosen])
+        columns = [(name, x[batched].reshape(count, -1)) for name, x in numbers.items()]
+        if numbers and self._library is not None:
+            columns.append(("written", self._numbers.arguments(numbers, len(values))[batched]))
+        q, q_dot = self._compute_starts(values[batched])
+        recorded_by_key = {"last": recorded.last_row, "kept": recorded.series, "met": recorded.event_times}
         out: dict[str, Any] = {name: np.zeros(count, np.int64) for name in ("why", "filled")}
         out |= {"work": np.zeros(3 * count, np.int64), "t": np.empty(count)}
-        out |= {name: np.full((count, *getattr(recorded, name).shape[1:]), np.nan) for name in ("last", "kept", "met")}
-        self._batch.run(self._base, q, q_dot, [(name, np.ascontiguousarray(x)) for name, x in varied], self.instants,
+        out |= {key: np.full((count, *array.shape[1:]), np.nan) for key, array in recorded_by_key.items()}
+        self._batch.run(self._base, q, q_dot, [(name, np.ascontiguousarray(x)) for name, x in columns], self.instants,
                         self.outputs.columns, self.scene.spec.t_end, out)  # fmt: skip
-        why = np.array([*_core.reasons, "start"])[out["why"]]
-        good = np.isin(why, (END, EVENT)) & (out["filled"] > 0)
-        to = chosen[good]
-        recorded.last[to], recorded.kept[to], recorded.met[to] = (out[name][good] for name in ("last", "kept", "met"))
-        status[to] = DONE
-        for k in np.flatnonzero(why == EVENT):
+        reasons = np.array([*_core.reasons, "start"])[out["why"]]
+        is_regular = np.isin(reasons, (END, EVENT)) & (out["filled"] > 0)
+        for key, array in recorded_by_key.items():
+            array[batched[is_regular]] = out[key][is_regular]
+        status[batched[is_regular]] = DONE
+        for k in np.flatnonzero(reasons == EVENT):
             stopping = [j for j, event in enumerate(self.ready.events) if event.stop]
-            j = max(stopping, key=lambda j: (out["met"][k, j] == out["met"][k, j], out["met"][k, j]))
-            message[chosen[k]] = (
+            times = out["met"][k]
+            j = max(stopping, key=lambda j: (times[j] == times[j], times[j]))  # NaN first
+            message[batched[k]] = (
                 f"stopped by the event at t = {out['t'][k]:.9g} s: {self.ready.events[j].label['name']}"
             )
-        return int(out["work"].reshape(-1, 3)[good, 0].sum())
+        return int(out["work"].reshape(-1, 3)[is_regular, 0].sum())
 
-    def _starts(self, values: Array) -> tuple[Array, Array]:
-        """Return q and q_dot of some members, (members, d) each."""
+    def _compute_starts(self, values: Array) -> tuple[Array, Array]:
+        """Return q and q_dot at the start of some members, (members, d) each."""
         q, q_dot = np.tile(self._q, (len(values), 1)), np.tile(self.ready.start.q_dot, (len(values), 1))
         for k, name in enumerate(self.names):
-            for prefix, to in (("initial.q.", q), ("initial.q_dot.", q_dot)):
+            for prefix, start in (("initial.q.", q), ("initial.q_dot.", q_dot)):
                 if name.startswith(prefix):
-                    to[:, self.mechanism.independent.index(name.removeprefix(prefix))] = values[:, k]
+                    start[:, self.mechanism.independent.index(name.removeprefix(prefix))] = values[:, k]
         return q, q_dot
 
-    def _run_singly(
-        self,
-        which: IntArray,
-        values: Array,
-        status: Statuses,
-        message: list[str],
-        outputs: dict[str, Array],
+    def _run_separately(
+        self, indices: IntArray, values: Array, status: Statuses, message: list[str], outputs: dict[str, Array]
     ) -> int:
-        """Run members as runs of their own; their loops still turn in threads."""
-        if not len(which):
+        """Prepare and run members one by one, their step loops in threads; return their right-hand sides."""
+        if not len(indices):
             return 0
-
         cancelled = Event()
 
-        def one(k: int) -> int:
-            status[k], message[k], rhs = self._single(values[k], k, outputs, cancelled)
+        def run_one(k: int) -> int:
+            status[k], message[k], rhs = self._run_member(values[k], k, outputs, cancelled)
             return rhs
 
-        if self._threads == 1 or len(which) == 1:
-            return sum(one(int(k)) for k in which)
+        if self._threads == 1 or len(indices) == 1:
+            return sum(run_one(int(k)) for k in indices)
         with ThreadPoolExecutor(self._threads) as pool:
             try:
-                return sum(pool.map(one, [int(k) for k in which]))
+                return sum(pool.map(run_one, [int(k) for k in indices]))
             except BaseException:
                 cancelled.set()
                 pool.shutdown(cancel_futures=True)
                 raise
 
-    def _single(self, values: Array, k: int, outputs: dict[str, Array], cancelled: Event) -> tuple[int, str, int]:
-        """Run one member and enter its outputs: its output instants and its q_d may be its own."""
+    def _run_member(self, values: Array, k: int, outputs: dict[str, Array], cancelled: Event) -> tuple[int, str, int]:
+        """Run one member, enter its outputs, and return its status, message and right-hand sides."""
 
         def require_not_cancelled(t: float, t_end: float) -> None:
             if cancelled.is_set():
@@ -245,8 +328,8 @@ class Members:
             return FAILED, str(error), 0
         if ended == "interrupted":
             raise interrupt_again(message)
-        own = Outputs(self._outputs, ready)
-        for name, value in own.compute(own.recorded(rows)).items():
+        member_outputs = Outputs(self._output_specs, ready)  # output instants and q_d may differ between members
+        for name, value in member_outputs.compute(member_outputs.record(rows)).items():
             outputs[name][k] = value[0]
         rhs = ready.loop.stats()["rhs"]
         status, message = (
@@ -261,18 +344,20 @@ class Members:
                     status, message = FAILED, f"output {name!r} raised {type(error).__name__}: {error}"
         return status, message, rhs
 
-    # --- what is asked ---------------------------------------------------------------------------
+    # --- preparation -----------------------------------------------------------------------------
 
-    def _require_one_time(self) -> None:
-        """Refuse trajectories at instants that are not the same of all members (InputError)."""
-        own = [name for name in self.names if name in ("t_end", "solver.output_dt")]
-        over_time = [name for name, output in self.outputs.outputs.items() if "time" in output.dims]
-        if own and over_time:
-            says = f"a trajectory is kept at the same instants of all members, which {own[0]} makes others"
-            raise InputError(f"{self.scene.name}: outputs: {over_time[0]}: {says}; keep a reduction")
+    def _require_equal_instants(self) -> None:
+        """Refuse trajectories if output instants differ between members (InputError)."""
+        time_variables = [name for name in self.names if name in ("t_end", "solver.output_dt")]
+        trajectories = [name for name, output in self.outputs.outputs.items() if "time" in output.dims]
+        if time_variables and trajectories:
+            raise InputError(
+                f"{self.scene.name}: outputs: {trajectories[0]}: a trajectory needs the same output instants for all "
+                f"members, but {time_variables[0]} varies; use a reduction"
+            )
 
-    def _shapes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
-        """Dimensions and shape of each output, a function's found by calling it on the scene itself."""
+    def _find_shapes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
+        """Return dimensions and shape of each output; functions are called on a run of the scene itself."""
         shapes = {name: (output.dims, output.shape) for name, output in self.outputs.outputs.items()}
         if not self.outputs.functions:
             return shapes
@@ -290,42 +375,33 @@ class Members:
             shapes[name] = (tuple(f"{name}_{k}" for k in range(value.ndim)), value.shape)
         return shapes
 
-    def _terms(self, count: int) -> Library | None:
-        """Compiled terms where they are asked for, are there, or repay compiling."""
-        wanted, which = self.scene.spec.solver.terms, self._numbers.which
-        if wanted == "pinocchio":
+    def _select_library(self, count: int) -> Library | None:
+        """Return compiled terms if they are requested, exist, or save time; None for Pinocchio's terms."""
+        terms, varying_arguments = self.scene.spec.solver.terms, self._numbers.which
+        if terms == "pinocchio":
             return None
-        if wanted == "generated":
-            return compile_terms(self.mechanism, which=which)
-        library = find_compiled_terms(self.mechanism, which)
+        if terms == "generated":
+            return compile_terms(self.mechanism, which=varying_arguments)
+        library = find_compiled_terms(self.mechanism, varying_arguments)
         if library is not None or count < 2 or explain_too_large(self.mechanism):
             return library
-        if count * self.work() < WORTH * self.mechanism.n:
+        if count * self.count_rhs() < MIN_RHS_TO_COMPILE * self.mechanism.n:
             return None
         try:
-            return compile_terms(self.mechanism, which=which)
-        except InputError:  # no compiler, no CasADi: the general terms do
+            return compile_terms(self.mechanism, which=varying_arguments)
+        except InputError:  # without a compiler or CasADi, Pinocchio's terms are used
             return None
-
-    def work(self) -> int:
-        """Right-hand sides of the scene itself."""
-        try:
-            _, status, message = record_rows(self.ready)
-        except CkcError:
-            return 0
-        if status == "interrupted":
-            raise interrupt_again(message)
-        return int(self.ready.loop.stats()["rhs"])
 
     def _can_be_batched(self) -> bool:
-        """Whether members differ in nothing but what a loop that is there can be given."""
+        """Return whether members differ only in numbers that a native loop can take."""
         spec, mechanism = self.scene.spec, self.mechanism
-        starts = [name for k, name in enumerate(self.names) if k not in self._parameters]
-        positions = [name for name in starts if name.startswith("initial.q.")]
-        known = all(name.rpartition("initial.q.")[2] in mechanism.independent for name in positions) and all(
-            name.startswith(("initial.q.", "initial.q_dot.")) for name in starts
-        )
-        if not known or not self._numbers.is_batched or self.outputs.functions or not mechanism.tree.is_euclidean:
+        scene_keys = [name for k, name in enumerate(self.names) if k not in self._parameters]
+        positions = [name for name in scene_keys if name.startswith("initial.q.")]
+        if not all(name.startswith(("initial.q.", "initial.q_dot.")) for name in scene_keys):
+            return False
+        if not all(name.rpartition("initial.q.")[2] in mechanism.independent for name in positions):
+            return False
+        if not self._numbers.is_batched or self.outputs.functions or not mechanism.tree.is_euclidean:
             return False
         if spec.initial.w is not None or spec.solver.max_wall_s is not None or mechanism.splits_root:
             return False
@@ -333,7 +409,7 @@ class Members:
             return False
         if spec.initial.at is not None and (positions or self._parameters):
             return False
-        if not self._control_stays():
+        if not self._has_constant_control():
             return False
         start = self.ready.start.at
         self._base = start.q_tree if spec.initial.at is not None else find_branch(mechanism, spec.initial.q).q_tree
@@ -342,14 +418,69 @@ class Members:
             self._q[k] = spec.initial.q.get(name, self._q[k])
         return True
 
-    def _control_stays(self) -> bool:
-        """Whether what acts is the same table for all members."""
+    def _has_constant_control(self) -> bool:
+        """Return whether the native controller is the same for all members."""
         control = self.ready.tables[2]
         law = control.get("law", {"kind": "none"})
         if law["kind"] == "call":
             return False
         if not self._parameters or law["kind"] == "none":
             return True
-        of_plant = law["kind"] == "set_point" and getattr(self.scene.spec.controller, "model", None) is None
-        by_point = law.get("desired", {}).get("kind") == "point"
-        return not (of_plant or by_point or "observer" in control.get("sensor", {}))
+        uses_plant = law["kind"] == "set_point" and getattr(self.scene.spec.controller, "model", None) is None
+        follows_point = law.get("desired", {}).get("kind") == "point"
+        return not (uses_plant or follows_point or "observer" in control.get("sensor", {}))
+
+
+class MemberNumbers:
+    """Numbers of a mechanism's model as functions of the parameters that an ensemble varies.
+
+    Parameters
+    ----------
+    parameters : ParameterMap
+    names : sequence of str
+        Single parameters that vary.
+
+    Attributes
+    ----------
+    is_batched : bool
+        Whether a batch can take all numbers. If not, each member's mechanism is rebuilt.
+    which : dict of str to bool arrays
+        Numbers that are not zero for some member: the arguments of compiled terms.
+    """
+
+    def __init__(self, parameters: ParameterMap, names: Sequence[str]) -> None:
+        self._map, self.names = parameters, tuple(names)
+        self.which = present(parameters.numbers)
+        self.is_batched = True
+        if not self.names:
+            return
+        trial = np.random.default_rng(0).uniform(0.5, 1.0, (1, len(self.names)))
+        numbers, _ = parameters.evaluate(self.names, trial)
+        self.is_batched = set(numbers) <= BATCHED_NUMBERS | DERIVED_NUMBERS and parameters.reproduces(self.names)
+        if self.is_batched:
+            for key in BATCHED_NUMBERS & set(numbers):
+                self.which[key] = self.which[key] | present({key: numbers[key][0]})[key]
+
+    def evaluate(self, members: Array) -> tuple[dict[str, Array], BoolArray]:
+        """Return the numbers that differ between members, and which members are physical.
+
+        Parameters
+        ----------
+        members : (members, names) array
+            Values of the parameters.
+
+        Returns
+        -------
+        dict of str to (members, ...) array
+        (members,) array of bool
+        """
+        numbers, is_physical = self._map.evaluate(self.names, members)
+        return {key: x for key, x in numbers.items() if key in BATCHED_NUMBERS}, is_physical
+
+    def arguments(self, numbers: Mapping[str, Array], members: int) -> Array:
+        """Return the arguments of compiled terms, (members, arguments), from the numbers that differ."""
+        columns = []
+        for key, base in self._map.numbers.items():
+            part = numbers[key] if key in numbers else np.broadcast_to(base, (members, *base.shape))
+            columns.append(part[:, self.which[key]])
+        return np.ascontiguousarray(np.concatenate(columns, axis=1))

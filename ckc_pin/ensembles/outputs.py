@@ -1,4 +1,4 @@
-"""What is kept of each member: reductions of what the loop records, or functions of a whole `Run`."""
+"""Outputs of an ensemble's members: reductions of recorded quantities, or functions of a `Run`."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from ckc_pin.run.prepare import Prepared
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import record_columns
 
-__all__ = ["Function", "Output", "Outputs", "Recorded"]
+__all__ = ["NAMED_REDUCTIONS", "Function", "Output", "Outputs", "Recorded"]
 
 Function = Callable[[Run], Any]
 
-SHORT = {
+NAMED_REDUCTIONS = {
     "max_abs_u": OutputSpec(of="u", reduce="max_abs"),
     "max_abs_tau": OutputSpec(of="tau", reduce="max_abs"),
     "max_phi": OutputSpec(of="phi", reduce="max_abs"),
-}  # one number each: the largest of all components
+}  # the largest of all components, one number each
 VECTORS = {"q_tree": "coordinate", "v_tree": "coordinate", "u": "independent", "tau": "actuated", "phi": "row",
            "error": "independent"}  # fmt: skip
 SCALARS = ("energy", "dissipated", "lyapunov", "t")
@@ -37,26 +37,26 @@ EVENT = "event."
 
 @dataclass(frozen=True)
 class Recorded:
-    """What the loops have recorded of some members.
+    """Recorded quantities of some members, NaN where a member has none.
 
     Attributes
     ----------
-    last : (members, width) array
-        The last row of each; NaN for those that did not begin.
-    kept : (members, columns, instants) array
-        Columns over time; NaN where a member did not get to.
-    met : (members, events) array
-        When each event was met first, s; NaN for never.
+    last_row : (members, width) array
+        Last row of the record; NaN for members that did not begin.
+    series : (members, columns, instants) array
+        Columns at the output instants; NaN after a member's end.
+    event_times : (members, events) array
+        First occurrence of each event, s.
     """
 
-    last: Array
-    kept: Array
-    met: Array
+    last_row: Array
+    series: Array
+    event_times: Array
 
 
 @dataclass(frozen=True)
 class Output:
-    """One output: the dimensions after the member's, its shape in them, and the unit of each component."""
+    """One output: its dimensions after the member's, its shape in them, the units of its components, its function."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
@@ -65,7 +65,7 @@ class Output:
 
 
 class Outputs:
-    """Outputs of a sweep for a scene.
+    """The outputs of a sweep for a prepared scene.
 
     Parameters
     ----------
@@ -75,21 +75,22 @@ class Outputs:
     Raises
     ------
     InputError
-        No such quantity, coordinate or event (those there are are listed).
+        Unknown quantity, coordinate or event. The message lists the valid ones.
 
     Attributes
     ----------
     columns : list of int
-        Which columns are kept over time.
-    whole : bool
-        Whether anything is kept over time; else the last row is enough.
+        Columns of the record that are needed at all output instants.
+    needs_series : bool
+        Whether an output needs more than the last row.
     functions : dict of str to callable
+        Outputs that are functions of a run.
     outputs : dict of str to Output
-        Those that are no functions.
+        All other outputs.
     """
 
     def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
-        self._ready, self._places = ready, record_columns(ready.mechanism)
+        self._ready, self._slices = ready, record_columns(ready.mechanism)
         self._units = quantity_units(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
@@ -98,30 +99,30 @@ class Outputs:
             if callable(spec):
                 self.functions[name] = spec
             else:
-                self.outputs[name] = self._output(name, spec)
-        self.whole = bool(self.columns) or bool(self.functions)
+                self.outputs[name] = self._create_output(name, spec)
+        self.needs_series = bool(self.columns) or bool(self.functions)
 
     def compute(self, recorded: Recorded) -> dict[str, Array]:
         """Return the outputs of some members, (members, ...) each."""
         return {name: output.compute(recorded) for name, output in self.outputs.items()}
 
-    def recorded(self, rows: Array) -> Recorded:
-        """Return what a run of what was prepared has recorded, as of one member."""
+    def record(self, rows: Array) -> Recorded:
+        """Return the recorded quantities of one member from the rows of its run."""
         instants, events = self._ready.instants, self._ready.events
-        kept = np.full((1, len(self.columns), len(instants)), np.nan)
-        at = {float(t): i for i, t in enumerate(instants)}
+        series = np.full((1, len(self.columns), len(instants)), np.nan)
+        index_of = {float(t): i for i, t in enumerate(instants)}
         for row in rows:
-            i = at.get(float(row[0]))
+            i = index_of.get(float(row[0]))
             if i is not None:
-                kept[0, :, i] = row[self.columns]
-        met = np.full((1, len(events)), np.nan)
+                series[0, :, i] = row[self.columns]
+        event_times = np.full((1, len(events)), np.nan)
         for t, event, _ in self._ready.loop.met():
-            met[0, event] = np.fmin(met[0, event], t)
-        return Recorded(rows[-1:], kept, met)
+            event_times[0, event] = np.fmin(event_times[0, event], t)
+        return Recorded(rows[-1:], series, event_times)
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
-        """What stands along each dimension."""
+        """Labels along each dimension."""
         mechanism = self._ready.mechanism
         rows = tuple(".".join(name) for name in mechanism.closure.names)
         return {"coordinate": mechanism.coordinates, "independent": mechanism.independent,
@@ -129,141 +130,150 @@ class Outputs:
 
     # --- construction ----------------------------------------------------------------------------
 
-    def _output(self, name: str, spec: str | OutputSpec) -> Output:
+    def _create_output(self, name: str, spec: str | OutputSpec) -> Output:
         if isinstance(spec, str):
-            if spec in SHORT:
-                inner = self._reduced(name, SHORT[spec])
-                unit = (joined(inner.units),)
-                return Output((), (), unit, lambda recorded: np.fmax.reduce(inner.compute(recorded), axis=1))
+            if spec in NAMED_REDUCTIONS:
+                components = self._create_reduction(name, NAMED_REDUCTIONS[spec])
+                unit = (joined(components.units),)
+                return Output((), (), unit, lambda recorded: np.fmax.reduce(components.compute(recorded), axis=1))
             spec = OutputSpec(of=spec)
         if spec.of == "settled":
-            return Output((), (), ("",), self._settled(name, spec.tolerance))
+            return Output((), (), ("",), self._create_settled(spec.tolerance))
         if spec.of == "energy_drift":
-            at = self._keep([self._places["energy"].start])
-            return Output((), (), ("J",), lambda recorded: _drift(recorded.kept[:, at[0]]))
+            (energy,) = self._require_series([self._slices["energy"].start])
+            return Output((), (), ("J",), lambda recorded: _compute_drift(recorded.series[:, energy]))
         if spec.of.startswith(EVENT):
-            event = self._event(name, spec.of.removeprefix(EVENT))
-            return Output((), (), ("s",), lambda recorded: recorded.met[:, event])
-        return self._reduced(name, spec)
+            event = self._find_event(name, spec.of.removeprefix(EVENT))
+            return Output((), (), ("s",), lambda recorded: recorded.event_times[:, event])
+        return self._create_reduction(name, spec)
 
-    def _reduced(self, name: str, spec: OutputSpec) -> Output:
+    def _create_reduction(self, name: str, spec: OutputSpec) -> Output:
         joints, smoothing = self._ready.mechanism.joints, self._ready.scene.spec.friction_smoothing
-        if spec.of == "dissipated" and joints.has_smooth_friction(smoothing):  # None in a run
-            return self._unknown(spec)
-        columns, dims, wanted = self._quantity(name, spec.of)
+        if spec.of == "dissipated" and joints.has_smooth_friction(smoothing):
+            return self._create_unknown(spec)
+        columns, dims, reference = self._find_columns(name, spec.of)
         shape = (len(columns),) if dims else ()
         units = self._units_of(spec)
-        if spec.reduce == "end" and wanted is None:
-            return Output(dims, shape, units, lambda recorded: _squeezed(recorded.last[:, columns], dims))
-        at, reduce = self._keep(columns), spec.reduce
+        if spec.reduce == "end" and reference is None:
+            return Output(dims, shape, units, lambda recorded: _squeeze(recorded.last_row[:, columns], dims))
+        indices, reduction = self._require_series(columns), spec.reduce
 
         def compute(recorded: Recorded) -> Array:
-            x = recorded.kept[:, at]
-            return _squeezed(_reduce(x if wanted is None else x - wanted, reduce, self._ready.instants), dims)
+            x = recorded.series[:, indices]
+            x = x if reference is None else x - reference
+            return _squeeze(_reduce(x, reduction, self._ready.instants), dims)
 
-        if reduce == "trajectory":
+        if reduction == "trajectory":
             return Output((*dims, "time"), (*shape, len(self._ready.instants)), units, compute)
         return Output(dims, shape, units, compute)
 
-    def _unknown(self, spec: OutputSpec) -> Output:
-        """Return an output of one number that is NaN."""
-        times = len(self._ready.instants) if spec.reduce == "trajectory" else None
-        dims, shape = ((), ()) if times is None else (("time",), (times,))
-        return Output(dims, shape, self._units_of(spec), lambda recorded: np.full((len(recorded.last), *shape), np.nan))
+    def _create_unknown(self, spec: OutputSpec) -> Output:
+        """Return an output of a scalar that is NaN, because a run does not compute it."""
+        instants = len(self._ready.instants) if spec.reduce == "trajectory" else None
+        dims, shape = ((), ()) if instants is None else (("time",), (instants,))
+        return Output(
+            dims, shape, self._units_of(spec), lambda recorded: np.full((len(recorded.last_row), *shape), np.nan)
+        )
 
-    def _quantity(self, name: str, of: str) -> tuple[list[int], tuple[str, ...], Array | None]:
-        """Where a quantity stands in a row, its dimension, and what is taken off it over time."""
-        mechanism, q = self._ready.mechanism, self._places["q_tree"].start
-        if of in mechanism.tree.index:
-            return [q + mechanism.tree.index[of]], (), None
-        if of == "error":
-            return [q + int(k) for k in mechanism.partition.q], ("independent",), self._wanted(name)
-        if of in VECTORS or of in SCALARS:
-            place = self._places[of]
-            return list(range(place.start, place.stop)), (VECTORS[of],) if of in VECTORS else (), None
-        choices = ", ".join([*VECTORS, *SCALARS, *DERIVED, f"{EVENT}NAME", *SHORT, *mechanism.coordinates])
-        raise InputError(f"outputs: {name}: no {of!r}; there are {choices}")
+    def _find_columns(self, name: str, quantity: str) -> tuple[list[int], tuple[str, ...], Array | None]:
+        """Return the columns of a quantity, its dimensions, and the values over time that are subtracted from it."""
+        mechanism, q = self._ready.mechanism, self._slices["q_tree"].start
+        if quantity in mechanism.tree.index:
+            return [q + mechanism.tree.index[quantity]], (), None
+        if quantity == "error":
+            return [q + int(k) for k in mechanism.partition.q], ("independent",), self._compute_q_d(name)
+        if quantity in VECTORS or quantity in SCALARS:
+            columns = self._slices[quantity]
+            dims = (VECTORS[quantity],) if quantity in VECTORS else ()
+            return list(range(columns.start, columns.stop)), dims, None
+        choices = ", ".join([*VECTORS, *SCALARS, *DERIVED, f"{EVENT}NAME", *NAMED_REDUCTIONS, *mechanism.coordinates])
+        raise InputError(f"outputs: {name}: no {quantity!r}; there are {choices}")
 
     def _units_of(self, spec: OutputSpec) -> tuple[str, ...]:
-        """The unit of each component; an integral's is over time."""
+        """Return the unit of each component; an integral is over time."""
         index = self._ready.mechanism.tree.index
-        own = [self._units["q_tree"][index[spec.of]]] if spec.of in index else self._units[spec.of]
-        return tuple(integral_unit(unit) if spec.reduce == "integral" else unit for unit in own)
+        units = [self._units["q_tree"][index[spec.of]]] if spec.of in index else self._units[spec.of]
+        return tuple(integral_unit(unit) if spec.reduce == "integral" else unit for unit in units)
 
-    def _wanted(self, name: str) -> Array:
-        """q_d over time, (d, instants)."""
-        law, instants = _law(self._ready), self._ready.instants
+    def _compute_q_d(self, name: str) -> Array:
+        """Return q_d at the output instants, (d, instants)."""
+        law, instants = _find_law(self._ready), self._ready.instants
         if isinstance(law, SetPoint):
             return np.tile(law.q_d[:, None], (1, len(instants)))
         if isinstance(law, Tracking) and callable(law.desired):
             return np.array([law.desired(float(t))[0] for t in instants]).T
-        says = "error is q - q_d, and this scene's controller has no q_d as a function of time"
-        raise InputError(f"outputs: {name}: {says}")
+        raise InputError(
+            f"outputs: {name}: error is q - q_d, but the scene's controller has no q_d as a function of time; choose "
+            "another output"
+        )
 
-    def _keep(self, wanted: list[int]) -> list[int]:
-        """Have columns kept over time; return where they are among those."""
-        self.columns += [column for column in wanted if column not in self.columns]
-        return [self.columns.index(column) for column in wanted]
+    def _require_series(self, columns: list[int]) -> list[int]:
+        """Record columns at all output instants; return their indices in `columns`."""
+        self.columns += [column for column in columns if column not in self.columns]
+        return [self.columns.index(column) for column in columns]
 
-    def _settled(self, name: str, tolerance: float) -> Callable[[Recorded], Array]:
-        """Whether at the end everything rests, and q is q_d where there is a set point."""
-        law, mechanism = _law(self._ready), self._ready.mechanism
-        reach = mechanism.tree.step_scale
-        q, v = self._places["q_tree"], self._places["v_tree"]
+    def _create_settled(self, tolerance: float) -> Callable[[Recorded], Array]:
+        """Return the function that is 1 for members at rest at their end, and at q_d of a set point."""
+        law, mechanism = _find_law(self._ready), self._ready.mechanism
+        step_scale = mechanism.tree.step_scale
+        q, v = self._slices["q_tree"], self._slices["v_tree"]
 
         def compute(recorded: Recorded) -> Array:
-            at_rest = np.all(np.abs(recorded.last[:, v]) <= tolerance * reach, axis=1)
+            last = recorded.last_row
+            is_settled = np.all(np.abs(last[:, v]) <= tolerance * step_scale, axis=1)
             if isinstance(law, SetPoint):
-                error = recorded.last[:, q][:, mechanism.partition.q] - law.q_d
-                at_rest &= np.all(np.abs(error) <= tolerance * reach[mechanism.partition.q], axis=1)
-            return np.where(np.isnan(recorded.last[:, 0]), np.nan, at_rest.astype(float))
+                error = last[:, q][:, mechanism.partition.q] - law.q_d
+                is_settled &= np.all(np.abs(error) <= tolerance * step_scale[mechanism.partition.q], axis=1)
+            return np.where(np.isnan(last[:, 0]), np.nan, is_settled.astype(float))
 
         return compute
 
-    def _event(self, name: str, which: str) -> int:
+    def _find_event(self, name: str, label: str) -> int:
+        """Return the index of an event, which is given by name or index."""
         names = [event.label["name"] for event in self._ready.events]
-        if which in names:
-            return names.index(which)
-        if which.isdigit() and int(which) < len(names):
-            return int(which)
-        there = ", ".join(f"{EVENT}{k} ({called})" for k, called in enumerate(names)) or "none"
-        raise InputError(f"outputs: {name}: the scene has no event {which!r}; it has {there}")
+        if label in names:
+            return names.index(label)
+        if label.isdigit() and int(label) < len(names):
+            return int(label)
+        valid = ", ".join(f"{EVENT}{k} ({event_name})" for k, event_name in enumerate(names)) or "none"
+        raise InputError(f"outputs: {name}: the scene has no event {label!r}; it has {valid}")
 
 
-def _law(ready: Prepared) -> Any:
+def _find_law(ready: Prepared) -> Any:
     return ready.controller.controller if isinstance(ready.controller, Sampled) else ready.controller
 
 
-def _squeezed(x: Array, dims: tuple[str, ...]) -> Array:
+def _squeeze(x: Array, dims: tuple[str, ...]) -> Array:
     return x if dims else x[:, 0]
 
 
-def _drift(energy: Array) -> Array:
-    """Largest |E - E(0)|, J."""
+def _compute_drift(energy: Array) -> Array:
+    """Return the largest |E - E(0)|, J."""
     return np.fmax.reduce(np.abs(energy - energy[:, :1]), axis=1)
 
 
-def _reduce(x: Array, how: Reduction, instants: Array) -> Array:
-    """Reduce (members, columns, instants) over time; instants that a member did not get to are left out.
+def _reduce(x: Array, reduction: Reduction, instants: Array) -> Array:
+    """Reduce (members, columns, instants) over time, ignoring instants after a member's end.
 
-    Each sum is over one member's own row, contiguous in memory, so that it does not depend on who else is there.
+    Each sum runs over one member's row, which is contiguous in memory, so that it does not depend on other members.
     """
-    if how == "trajectory":
+    if reduction == "trajectory":
         return x
-    if how == "end":
-        there = ~np.isnan(x)
-        last = x.shape[2] - 1 - np.argmax(there[:, :, ::-1], axis=2)
+    if reduction == "end":
+        is_recorded = ~np.isnan(x)
+        last = x.shape[2] - 1 - np.argmax(is_recorded[:, :, ::-1], axis=2)
         return np.take_along_axis(x, last[:, :, None], axis=2)[:, :, 0]
-    if how in ("min", "max", "max_abs"):
-        return (np.fmin if how == "min" else np.fmax).reduce(np.abs(x) if how == "max_abs" else x, axis=2)
-    y = x**2 if how == "rms" else x
+    if reduction in ("min", "max", "max_abs"):
+        reduce = (np.fmin if reduction == "min" else np.fmax).reduce
+        return np.asarray(reduce(np.abs(x) if reduction == "max_abs" else x, axis=2))
+    y = x**2 if reduction == "rms" else x
     area = np.diff(instants) * (y[:, :, 1:] + y[:, :, :-1]) / 2
-    lasted = np.where(np.isnan(area), 0.0, np.diff(instants))
+    durations = np.where(np.isnan(area), 0.0, np.diff(instants))
     integral = np.ascontiguousarray(np.where(np.isnan(area), 0.0, area)).sum(axis=2)
     integral = np.where(np.isnan(x[:, :, 0]), np.nan, integral)
-    if how == "integral":
+    if reduction == "integral":
         return integral
-    seconds = np.ascontiguousarray(lasted).sum(axis=2)
-    # no 0 / 0, whose NaN has another sign where it is computed several at a time
-    mean = np.divide(integral, seconds, out=np.full_like(integral, np.nan), where=seconds > 0)
-    return np.sqrt(mean) if how == "rms" else mean
+    duration = np.ascontiguousarray(durations).sum(axis=2)
+    # 0 / 0 would give NaN, whose sign depends on the number of members that NumPy divides at once.
+    mean = np.divide(integral, duration, out=np.full_like(integral, np.nan), where=duration > 0)
+    return np.sqrt(mean) if reduction == "rms" else mean

@@ -1,4 +1,4 @@
-"""How far an ensemble is, how fast, and how long it will take: a bar on a terminal and in a notebook."""
+"""Progress of an ensemble: a bar on a terminal and in a notebook, with rate and remaining time."""
 
 from __future__ import annotations
 
@@ -14,23 +14,28 @@ from ckc_pin.base.summary import in_notebook
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["Advance", "bar"]
+__all__ = ["Advance", "show_progress"]
 
-Advance = Callable[[int, int], None]  # members that are there, and in all
+Advance = Callable[[int, int], None]  # takes the numbers of finished members and of all members
 
 
 @contextmanager
-def bar(title: str, there: int) -> Iterator[Advance | None]:
-    """Show a bar where somebody looks on; gives a function of how many members are there, and how many there will be.
+def show_progress(title: str, finished_before: int) -> Iterator[Advance | None]:
+    """Show a progress bar while a `with` block runs.
 
     Parameters
     ----------
     title : str
-    there : int
-        Members from before, which say nothing about the rate.
+    finished_before : int
+        Members from an earlier command, which do not count for the rate.
+
+    Yields
+    ------
+    callable or None
+        Function that updates the bar; None without a terminal or notebook.
     """
     if in_notebook():
-        yield _NotebookBar(title, there)
+        yield _NotebookBar(title, finished_before)
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -40,38 +45,39 @@ def bar(title: str, there: int) -> Iterator[Advance | None]:
         yield None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
-    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as shown:
-        task: Any = shown.add_task(title, total=None, completed=there, rate="")
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True) as progress:
+        task: Any = progress.add_task(title, total=None, completed=finished_before, rate="")
 
-        def advance(done: int, total: int) -> None:
-            seconds = shown.tasks[0].elapsed or 0.0
-            rate = f"{(done - there) / seconds:.0f} a second" if seconds > 0 and done > there else ""
-            shown.update(task, completed=done, total=total, rate=rate)
+        def advance(finished: int, total: int) -> None:
+            elapsed = progress.tasks[0].elapsed or 0.0
+            new = finished - finished_before
+            rate = f"{new / elapsed:.0f} a second" if elapsed > 0 and new > 0 else ""
+            progress.update(task, completed=finished, total=total, rate=rate)
 
         yield advance
 
 
 class _NotebookBar:
-    """The page's own element below the cell, which stays there with the last it said; it needs no widgets."""
+    """A progress bar in a notebook, an HTML element below the cell. It needs no widgets."""
 
-    def __init__(self, title: str, there: int) -> None:
-        self.title, self.there = title, there
-        self.began = perf_counter()
-        self.shown: Any = None
+    def __init__(self, title: str, finished_before: int) -> None:
+        self.title, self.finished_before = title, finished_before
+        self.started = perf_counter()
+        self.handle: Any = None
 
-    def __call__(self, done: int, total: int) -> None:
-        """Say how far it is."""
+    def __call__(self, finished: int, total: int) -> None:
+        """Update the bar."""
         from IPython.display import display
 
-        seconds = perf_counter() - self.began
-        rate = (done - self.there) / seconds if seconds > 0 else 0.0
-        left = f", {(total - done) / rate:.0f} s left" if rate > 0 and done < total else ""
-        said = f"{done} of {total} members, {rate:.3g} a second{left}"
+        elapsed = perf_counter() - self.started
+        rate = (finished - self.finished_before) / elapsed if elapsed > 0 else 0.0
+        remaining = f", {(total - finished) / rate:.0f} s left" if rate > 0 and finished < total else ""
+        text = f"{finished} of {total} members, {rate:.3g} a second{remaining}"
         bundle = {
-            "text/plain": f"{self.title}: {said}",
-            "text/html": f'{escape(self.title)} <progress value="{done}" max="{total}"></progress> {said}',
+            "text/plain": f"{self.title}: {text}",
+            "text/html": f'{escape(self.title)} <progress value="{finished}" max="{total}"></progress> {text}',
         }
-        if self.shown is None:
-            self.shown = display(bundle, raw=True, display_id=True)  # type: ignore[no-untyped-call]
+        if self.handle is None:
+            self.handle = display(bundle, raw=True, display_id=True)  # type: ignore[no-untyped-call]
         else:
-            self.shown.update(bundle, raw=True)
+            self.handle.update(bundle, raw=True)

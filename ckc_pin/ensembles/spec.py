@@ -1,4 +1,4 @@
-"""A sweep's file, `NAME.sweep.toml`, as a typed structure."""
+"""Typed structure of a sweep's file, `NAME.sweep.toml`."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from ckc_pin.mechanism.library import is_path
 
 __all__ = [
     "KINDS",
+    "MAX_MEMBERS",
     "SUFFIX",
     "GridSpec",
     "OutputSpec",
     "Reduction",
     "SweepSpec",
     "VariableSpec",
+    "find_scene_path",
+    "parse_sweep",
     "read_sweep",
-    "sweep_of",
 ]
 
 SUFFIX = ".sweep.toml"
-MOST = 10**9  # members
+MAX_MEMBERS = 10**9
 
 Pair = tuple[float, float]
-Count = Annotated[int, msgspec.Meta(ge=1, le=MOST)]
+Count = Annotated[int, msgspec.Meta(ge=1, le=MAX_MEMBERS)]
 Reduction = Literal["end", "min", "max", "max_abs", "mean", "rms", "integral", "trajectory"]
 
 
@@ -38,18 +40,18 @@ class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class GridSpec(_Spec, frozen=True):
-    """Values at equal distances, both ends among them.
+    """Equidistant values, including both ends.
 
     Attributes
     ----------
-    start : its own
-        The first.
+    start : the variable's
+        First value.
         ``start = -1.9``
-    stop : its own
-        The last.
+    stop : the variable's
+        Last value.
         ``stop = 1.9``
     count
-        How many.
+        Number of values.
         ``count = 41``
     """
 
@@ -59,38 +61,40 @@ class GridSpec(_Spec, frozen=True):
 
 
 class VariableSpec(_Spec, frozen=True):
-    """How one variable differs between members: one of the keys.
+    """Distribution of one variable over the members, given by one of the keys.
 
-    Grids, lists and files are crossed with each other, the last one named changing fastest.
+    Grids, lists and files are crossed with each other. The last one named varies fastest.
 
     Attributes
     ----------
-    uniform : its own
-        From, to.
+    uniform : the variable's
+        Lower and upper end.
         ``uniform = [-1.9, -0.9]``
-    loguniform : its own
-        From, to, both greater than 0: the logarithm is uniform.
+    loguniform : the variable's
+        Lower and upper end, both greater than 0. The logarithm is uniform.
         ``loguniform = [0.1, 10.0]``
-    normal : its own
+    normal : the variable's
         Mean, standard deviation.
         ``normal = [0.2611, 0.01]``
-    lognormal : of its logarithm
+    lognormal : of the logarithm
         Mean and standard deviation of the logarithm.
         ``lognormal = [0.0, 0.1]``
-    sobol : its own
-        From, to: a scrambled Sobol sequence over all variables of this kind; members in powers of 2 are balanced.
+    sobol : the variable's
+        Lower and upper end. A scrambled Sobol sequence over all variables of this kind; balanced if ``members`` is a
+        power of 2.
         ``sobol = [-1.9, -0.9]``
-    lhs : its own
-        From, to: a Latin hypercube over all variables of this kind.
+    lhs : the variable's
+        Lower and upper end. A Latin hypercube over all variables of this kind.
         ``lhs = [-1.9, -0.9]``
     grid
-        Values at equal distances.
+        Equidistant values.
         ``grid = {start = -1.9, stop = 1.9, count = 41}``
-    list : its own
+    list : the variable's
         Values.
         ``list = [0.2, 0.3, 0.5]``
     file
-        A CSV file beside this one, whose first row names variables; those of one file go together, a row each.
+        A CSV file in the folder of this one, whose first row names variables. The variables of one file take their
+        values from the same row.
         ``file = "starts.csv"``
     """
 
@@ -106,11 +110,11 @@ class VariableSpec(_Spec, frozen=True):
 
     @property
     def kind(self) -> str:
-        """Which key it has."""
-        return self.given()[0]
+        """The key that is set."""
+        return self.find_keys()[0]
 
-    def given(self) -> list[str]:
-        """Return the keys it has."""
+    def find_keys(self) -> list[str]:
+        """Return the keys that are set."""
         keys = zip(self.__struct_fields__, KINDS, strict=True)
         return [key for name, key in keys if getattr(self, name) is not None]
 
@@ -119,21 +123,21 @@ KINDS = VariableSpec.__struct_encode_fields__
 
 
 class OutputSpec(_Spec, frozen=True):
-    """A quantity of a run, and what is kept of it.
+    """A quantity of a run and its reduction.
 
     Attributes
     ----------
     of
         A coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
         ``dissipated`` (NaN with ``friction_smoothing``), ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``,
-        ``max_phi``, ``energy_drift`` (largest change), ``settled`` (1 where everything rests at the end, if only to
-        turn round, at q_d if there is one, 0 where not), ``event.NAME`` or ``event.K`` (when that was met first).
+        ``max_phi``, ``energy_drift`` (largest change), ``settled`` (1 if all rates are zero at the end, and q = q_d
+        of a set point; else 0), ``event.NAME`` or ``event.K`` (its first occurrence, s).
         ``of = "error"``
     reduce
-        What is kept of it over the member's output instants; of those named after ``t`` nothing but themselves.
+        Reduction over the member's output instants. The quantities that are listed after ``t`` are already reduced.
         ``reduce = "max_abs"``
     tolerance : rad, of the size
-        Of ``settled``: of each coordinate and its rate.
+        For ``settled``, of each coordinate and its rate.
         ``tolerance = 1e-4``
     """
 
@@ -143,28 +147,28 @@ class OutputSpec(_Spec, frozen=True):
 
 
 class SweepSpec(_Spec, frozen=True):
-    """The whole file.
+    """The complete file.
 
     Attributes
     ----------
     scene
-        A scene's shipped name, or its path beside this file.
+        A scene's shipped name, or its path relative to this file.
         ``scene = "five_bar/swing"``
     variables
-        By a parameter's name (see "parameters") or a scene's key: how it differs; a plain list is short for
+        Distribution of each variable, by a parameter's name (see "parameters") or a scene's key. A list is short for
         ``{list = ...}``.
         ``variables = {"link.link_2.mass" = {normal = [0.2611, 0.01]}}``
     outputs
-        What is kept of each member, under names of yours; a string is short for ``{of = ...}``.
+        Quantities to keep of each member, by names of your choice. A string is short for ``{of = ...}``.
         ``outputs = {end = "q_tree", worst = {of = "error", reduce = "max_abs"}}``
     members
-        How many, at each point of what is crossed; needed where something is drawn at random.
+        Number of members, at each point of the crossed variables. Needed if a variable is random.
         ``members = 1000``
     seed
-        Of what is drawn.
+        Seed of random variables.
         ``seed = 1``
     overrides
-        Of the scene, for all members, by dotted key.
+        Overrides of the scene, for all members, by dotted key.
         ``overrides = {t_end = 0.5, "solver.rtol" = 1e-6}``
     """
 
@@ -182,21 +186,21 @@ def read_sweep(path: str | Path) -> tuple[SweepSpec, Sources]:
     Raises
     ------
     InputError
-        No such file, malformed TOML, an unknown key, a wrong type or value.
+        The file does not exist, is not TOML, or has an unknown key or a wrong value.
     """
     path = Path(path)
     data = read_toml(read_text(path, "sweep"), str(path))
     join_dotted_keys(data, "overrides")
-    return sweep_of(data, Sources(str(path), path.parent)), Sources(str(path), path.parent)
+    return parse_sweep(data, Sources(str(path), path.parent)), Sources(str(path), path.parent)
 
 
-def sweep_of(data: dict[str, Any], sources: Sources) -> SweepSpec:
-    """Check parsed data (InputError)."""
+def parse_sweep(data: dict[str, Any], sources: Sources) -> SweepSpec:
+    """Return the structure of parsed TOML (InputError)."""
     if isinstance(data.get("variables"), dict):
-        data["variables"] = dict(_variables("", data["variables"]))
+        data["variables"] = dict(_join_variable_names("", data["variables"]))
     spec = convert(data, SweepSpec, sources.name)
     for name, variable in spec.variables.items():
-        _check(name, variable, sources.name)
+        _require_valid(name, variable, sources.name)
     if not spec.variables:
         raise InputError(f'{sources.name}: variables: name at least one, e.g. "initial.q.JOINT" = {{uniform = [a, b]}}')
     if not spec.outputs:
@@ -204,34 +208,35 @@ def sweep_of(data: dict[str, Any], sources: Sources) -> SweepSpec:
     return spec
 
 
-def scene_path(spec: SweepSpec, sources: Sources) -> str | Path:
-    """Return the scene that a sweep names: beside its file where that is a path."""
+def find_scene_path(spec: SweepSpec, sources: Sources) -> str | Path:
+    """Return the name of a sweep's scene, or its path, which is relative to the sweep's file."""
     if sources.folder is not None and is_path(spec.scene):
         return sources.folder / spec.scene
     return spec.scene
 
 
-def _variables(key: str, table: Mapping[str, Any]) -> Any:
-    """Join tables into dotted names, down to those that say how a variable differs."""
+def _join_variable_names(key: str, table: Mapping[str, Any]) -> Any:
+    """Yield dotted names of nested tables, each with the table of a variable's distribution."""
     for name, value in table.items():
         if isinstance(value, dict) and value and not any(inner in KINDS for inner in value):
-            yield from _variables(f"{key}{name}.", value)
+            yield from _join_variable_names(f"{key}{name}.", value)
         elif isinstance(value, list):
             yield f"{key}{name}", {"list": value}
         else:
             yield f"{key}{name}", value
 
 
-def _check(name: str, variable: VariableSpec, source: str) -> None:
+def _require_valid(name: str, variable: VariableSpec, source: str) -> None:
     where = f"{source}: variables: {name}"
-    given = variable.given()
-    if len(given) != 1:
-        said = f"{' and '.join(given)} are given" if given else "nothing is given"
-        raise InputError(f"{where}: {said}; give one of {', '.join(KINDS)}")
-    pair: Any = getattr(variable, given[0], None)
-    if given[0] in ("uniform", "sobol", "lhs", "loguniform") and not pair[0] <= pair[1]:
-        raise InputError(f"{where}: {given[0]} = [{pair[0]:g}, {pair[1]:g}]: from the smaller to the larger number")
-    if given[0] == "loguniform" and not pair[0] > 0:
+    keys = variable.find_keys()
+    if len(keys) != 1:
+        problem = f"{' and '.join(keys)} are given" if keys else "nothing is given"
+        raise InputError(f"{where}: {problem}; give one of {', '.join(KINDS)}")
+    kind = keys[0]
+    pair: Any = getattr(variable, kind, None)
+    if kind in ("uniform", "sobol", "lhs", "loguniform") and not pair[0] <= pair[1]:
+        raise InputError(f"{where}: {kind} = [{pair[0]:g}, {pair[1]:g}]: expected the smaller number first")
+    if kind == "loguniform" and not pair[0] > 0:
         raise InputError(f"{where}: loguniform = [{pair[0]:g}, {pair[1]:g}]: expected numbers greater than 0")
-    if given[0] in ("normal", "lognormal") and not pair[1] >= 0:
-        raise InputError(f"{where}: {given[0]} = [mean, deviation]: the deviation {pair[1]:g} is negative")
+    if kind in ("normal", "lognormal") and not pair[1] >= 0:
+        raise InputError(f"{where}: {kind} = [mean, deviation]: the deviation {pair[1]:g} is negative")

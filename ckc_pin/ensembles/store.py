@@ -1,8 +1,8 @@
-"""Results on disk: a Zarr group that xarray opens, written chunk by chunk, each of them whole or not there.
+"""Store of an ensemble's results: a Zarr group that xarray opens, written atomically chunk by chunk.
 
 Every file has a checksum: a table in the group has those of the chunks, the group's attributes those of all other
-files. A store that is opened again is compared with them. Damaged chunks become pending, other damaged files are
-written again.
+files. They are checked when a store is opened again. Damaged chunks become pending, other damaged files are written
+again.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ from ckc_pin.ensembles.store_layout import (
 )
 from ckc_pin.errors import InputError
 
-__all__ = ["RESULTS", "STAYS", "Store", "require_libraries"]
+__all__ = ["RESULTS", "RESUME_HINT", "Store", "require_libraries"]
 
 RESULTS = "results.zarr"
-BLOCK = 2**20  # members whose status is read at once
+BLOCK_SIZE = 2**20  # members whose status is read at once
 MAX_NAMED_CHUNKS = 3  # damaged chunks that one message names
-STAYS = "what is there stays, and the same command goes on from it"
+RESUME_HINT = "finished members are kept, and the same command resumes the sweep"
 
 
 def require_libraries() -> None:
-    """Refuse to begin without xarray and Zarr (InputError)."""
+    """Raise InputError if xarray or Zarr is not installed."""
     try:
         import xarray  # noqa: F401
         import zarr  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(
-            f"ensembles are kept by {error.name}, which is not installed: pip install ckc_pin[ensembles]"
+            f"ensembles need {error.name}, which is not installed: pip install ckc_pin[ensembles]"
         ) from None
 
 
@@ -61,24 +61,25 @@ class Store:
     Parameters
     ----------
     path : Path or None
-        The group; None: in memory.
+        The group's folder; None for a store in memory.
     sweep : mapping
-        All that the results follow from, as plain data: who goes on with a store must have the same.
+        Everything that the results depend on. A store can only be resumed with the same content.
     members : Members
     count : int
+        Number of members.
     chunk : int
-        Members that are written together; of a store that is there its own is kept.
+        Number of members that are written together. An existing store keeps its number.
 
     Raises
     ------
     InputError
-        The store is of another sweep, is no store, is damaged in a way that cannot be repaired, or cannot be written.
+        The store belongs to another sweep, is not a store, cannot be repaired, or cannot be written.
 
     Attributes
     ----------
     chunk : int
     repairs : str
-        One line on what was damaged and is repaired or run again, empty where nothing was.
+        One line about damaged files that were repaired or are computed again; empty without any.
     """
 
     def __init__(self, path: Path | None, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
@@ -95,67 +96,66 @@ class Store:
         else:
             self._begin(path, min(chunk, count))
 
-    @property
-    def place(self) -> Any:
-        """What xarray opens."""
+    def open(self) -> Any:
+        """Return the store for xarray, which verifies checksums if it is on disk."""
         if self._checksums is None:
             return self._group.store
         from ckc_pin.ensembles.verified_store import open_verified
 
         return open_verified(self._checksums, read_files_attributes(self._checksums.path)["files"])
 
-    def pending(self) -> Iterator[tuple[int, int]]:
-        """Yield the chunks that are not there yet, as first and end of their members."""
+    def find_pending(self) -> Iterator[tuple[int, int]]:
+        """Yield first and end of the members of each pending chunk."""
         for block, status in self._statuses():
             for first in range(0, len(status), self.chunk):
                 end = min(first + self.chunk, len(status))
                 if (status[first:end] == PENDING).any():
                     yield block + first, block + end
 
-    def counts(self) -> dict[str, int]:
-        """Count members by how they ended."""
+    def count_statuses(self) -> dict[str, int]:
+        """Return the number of members by status."""
         counts = np.zeros(len(STATUS), dtype=np.int64)
         for _, status in self._statuses():
             counts += np.bincount(status, minlength=len(STATUS))
         return {name: int(counts[k]) for k, name in enumerate(STATUS)}
 
     def _statuses(self) -> Iterator[tuple[int, Any]]:
-        """Read how members ended, many chunks at a time."""
+        """Yield first member and statuses of blocks of many chunks."""
         status: Any = self._group[STATUS_NAME]
-        step = self.chunk * max(1, BLOCK // self.chunk)
+        step = self.chunk * max(1, BLOCK_SIZE // self.chunk)
         for first in range(0, self.count, step):
             for part in read_slices(status, first, min(first + step, self.count), self.chunk):
                 yield first, part
                 first += len(part)
 
     def _chunk_statuses(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield how the members of each chunk ended."""
+        """Yield the statuses of each chunk."""
         for _, status in self._statuses():
             for first in range(0, len(status), self.chunk):
                 yield status[first : first + self.chunk]
 
     def write(self, chunk: Chunk, names: tuple[str, ...]) -> None:
-        """Write a chunk; how its members ended comes last, and says that it is whole.
+        """Write a chunk. Its status is written last, which marks the chunk as complete.
 
         Raises
         ------
         InputError
-            It cannot be written: a full disk. What was written before is whole.
+            The chunk cannot be written, for example because the disk is full. Earlier chunks are complete.
         """
-        at = slice(chunk.first, chunk.first + len(chunk.status))
+        members = slice(chunk.first, chunk.first + len(chunk.status))
         group: Any = self._group
         try:
             for k, name in enumerate(names):
-                group[array_name(name)][at] = chunk.values[:, k]
+                group[array_name(name)][members] = chunk.values[:, k]
             for name, values in chunk.outputs.items():
-                group[array_name(name)][at] = values
+                group[array_name(name)][members] = values
             if any(chunk.message):
-                group[MESSAGE_NAME][at] = np.array(chunk.message, dtype=np.dtypes.StringDType())
+                group[MESSAGE_NAME][members] = np.array(chunk.message, dtype=np.dtypes.StringDType())
             if self._checksums is not None:
                 self._checksums.write(chunk.first // self.chunk, chunk.status)
-            group[STATUS_NAME][at] = chunk.status
+            group[STATUS_NAME][members] = chunk.status
         except OSError as error:
-            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}; {STAYS}") from None
+            raise InputError(f"{self.path}: cannot be written: {error.strerror or error}; {RESUME_HINT}") from None
 
     def _create_in_memory(self, chunk: int) -> Any:
         import zarr
@@ -184,19 +184,19 @@ class Store:
         self._use(path)
 
     def _open(self, path: Path) -> None:
-        """Open a store that is there, and repair it."""
+        """Open an existing store and repair it."""
         attributes = read_store_attributes(path)
         if attributes["identity"] != identify(self._sweep):
-            other = json.loads(attributes["sweep"])
-            differs = [key for key in self._sweep if other.get(key) != self._sweep[key]]
+            stored = json.loads(attributes["sweep"])
+            differences = [key for key in self._sweep if stored.get(key) != self._sweep[key]]
             raise InputError(
-                f"{path}: results of another sweep: {', '.join(differs) or 'its content'} differ; choose another "
+                f"{path}: results of another sweep: {', '.join(differences) or 'its content'} differ; choose another "
                 "DIR, or remove it"
             )
         try:
             if attributes["format"] == FORMAT:
-                found = read_files_attributes(path)
-                restored = restore_files(path, self._create(found["chunk"]), found["files"])
+                layout = read_files_attributes(path)
+                restored = restore_files(path, self._create(layout["chunk"]), layout["files"])
                 checksums = self._use(path)
                 self._repair(checksums, restored, checksums.find_damage(self._chunk_statuses()))
             else:
@@ -216,16 +216,16 @@ class Store:
         return checksums
 
     def _repair(self, checksums: ChunkChecksums, restored: list[str], damage: Iterable[tuple[int, str]]) -> None:
-        """Make damaged chunks pending, and say so."""
+        """Make damaged chunks pending, and describe all repairs."""
         damaged = []
-        for k, says in damage:
+        for k, sentence in damage:
             checksums.remove_chunk(k)
-            damaged.append(f"members {k * self.chunk} to {min((k + 1) * self.chunk, self.count) - 1} ({says})")
+            damaged.append(f"members {k * self.chunk} to {min((k + 1) * self.chunk, self.count) - 1} ({sentence})")
         parts = [f"written again: {_join(restored)}"] if restored else []
         parts += [f"computed again: {_join(damaged)}"] if damaged else []
         self.repairs = f"{self.path}: {'; '.join(parts)}" if parts else ""
 
 
 def _join(parts: list[str]) -> str:
-    more = len(parts) - MAX_NAMED_CHUNKS
-    return ", ".join(parts[:MAX_NAMED_CHUNKS]) + (f" and {more} more" if more > 0 else "")
+    omitted = len(parts) - MAX_NAMED_CHUNKS
+    return ", ".join(parts[:MAX_NAMED_CHUNKS]) + (f" and {omitted} more" if omitted > 0 else "")

@@ -1,13 +1,13 @@
-"""The files of an ensemble's store that never change: its arrays' documents, labels and attributes.
+"""Constant files of an ensemble's store: the documents of its arrays, labels and attributes.
 
-The attributes of the group and of its group of checksums have a checksum of their own. The latter have the checksums of
-all these files. The files follow from the sweep, so that damaged ones are written again.
+The attributes of the group and of its group of checksums contain their own checksum. The latter also contain the
+checksums of all other constant files. These follow from the sweep, so that damaged ones can be written again.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from ckc_pin.mechanism.units import joined
 __all__ = [
     "FORMAT", "MESSAGE_NAME", "STATUS_NAME", "array_name", "array_names",
     "convert_files", "create_arrays", "create_store", "identify", "read_files_attributes", "read_store_attributes",
-    "require_free_names", "restore_files", "set_store_attributes", "units_beside",
+    "require_free_names", "restore_files", "set_store_attributes", "unit_coordinate_name",
 ]  # fmt: skip
 
 FORMAT = 2
@@ -37,8 +37,8 @@ UNITS = "SI units: s, m, rad, kg, N, N m, J"
 
 
 def create_store(folder: Path, sweep: Mapping[str, Any], members: Members, count: int, chunk: int) -> None:
-    """Create a store in a folder; one without attributes is not finished."""
-    # Zarr writes files in a thread of its own. It would go on after an interrupt, while the caller removes the folder.
+    """Create a store in a folder. Its attributes are written last, which marks it as complete."""
+    # Zarr writes files in another thread, which would continue after an interrupt while the caller removes the folder.
     with uninterrupted_thread() as pool:
         pool.submit(_write_store, folder, sweep, members, count, chunk).result()
 
@@ -56,17 +56,17 @@ def _write_store(folder: Path, sweep: Mapping[str, Any], members: Members, count
 
 
 def array_names(members: Members) -> list[str]:
-    """Return the arrays over members, the status first."""
+    """Return the names of the arrays over members, the status first."""
     return [STATUS_NAME, MESSAGE_NAME, *map(array_name, (*members.names, *members.shapes))]
 
 
 def identify(sweep: Any) -> str:
-    """Return a checksum of all that the results follow from."""
+    """Return the hash of everything that the results depend on."""
     return sha256(msgspec.json.encode(sweep, order="deterministic")).hexdigest()
 
 
 def set_store_attributes(group: Any, sweep: Mapping[str, Any]) -> None:
-    """Give a group the attributes that say whose results it has."""
+    """Set the attributes of a group that identify its sweep."""
     attributes = {"format": FORMAT, "units": UNITS, "sweep": json.dumps(sweep), "identity": identify(sweep)}
     _set_attributes(group, attributes)
 
@@ -77,16 +77,16 @@ def read_store_attributes(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        They are damaged; there is no store; it has another format.
+        The attributes are damaged, or the folder is not a store or has an unsupported format.
     """
     attributes = _read_attributes(path, path)
     if "format" not in attributes or "identity" not in attributes:
-        raise InputError(f"{path / DOCUMENT}: not begun as results of a sweep; remove {path}, or choose another DIR")
+        raise InputError(f"{path / DOCUMENT}: not a store of a sweep; remove {path}, or choose another DIR")
     if "checksum" in attributes or attributes["format"] == FORMAT:
-        sound = _has_sound_checksum(attributes)
+        is_sound = _has_sound_checksum(attributes)
     else:
-        sound = attributes["format"] != FORMAT_WITHOUT_CHECKSUMS or _has_sound_sweep(attributes)
-    if not sound:
+        is_sound = attributes["format"] != FORMAT_WITHOUT_CHECKSUMS or _has_sound_sweep(attributes)
+    if not is_sound:
         raise _damaged(path, path)
     if attributes["format"] not in (FORMAT, FORMAT_WITHOUT_CHECKSUMS):
         raise InputError(f"{path}: results of format {attributes['format']}; this program reads {FORMAT}; {REMOVE}")
@@ -99,7 +99,7 @@ def read_files_attributes(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        They are damaged.
+        The attributes are damaged.
     """
     attributes = _read_attributes(path / CHECKSUMS, path)
     if not _has_sound_checksum(attributes):
@@ -117,14 +117,16 @@ def _read_attributes(group: Path, path: Path) -> dict[str, Any]:
 
     try:
         return dict(zarr.open_group(group, mode="r", zarr_format=3, use_consolidated=False).attrs)
-    except Exception as error:  # whatever a damaged document makes Zarr raise
-        says = f"cannot be read ({type(error).__name__}), so {path.name} is damaged or has no results of a sweep"
-        raise InputError(f"{group / DOCUMENT}: {says}; remove {path}, or choose another DIR") from None
+    except Exception as error:  # a damaged document may make Zarr raise anything
+        raise InputError(
+            f"{group / DOCUMENT}: cannot be read ({type(error).__name__}), so {path.name} is damaged or not a store of "
+            f"a sweep; remove {path}, or choose another DIR"
+        ) from None
 
 
 def _damaged(group: Path, path: Path) -> InputError:
     return InputError(
-        f"{group / DOCUMENT}: its checksum differs, so it is damaged; remove {path}, or choose another DIR"
+        f"{group / DOCUMENT}: is damaged, because its checksum is wrong; remove {path}, or choose another DIR"
     )
 
 
@@ -140,15 +142,15 @@ def _has_sound_sweep(attributes: Mapping[str, Any]) -> bool:
 
 
 def _checksum_attributes(attributes: Mapping[str, Any]) -> str:
-    """Return the checksum of the attributes written by this program, ignoring attributes that others added."""
-    own = {
+    """Return the checksum of the attributes that this program writes, ignoring other attributes."""
+    written_keys = {
         key: attributes.get(key) for key in ("format", "units", "sweep", "identity", "coordinates", "chunk", "files")
     }
-    return checksum(msgspec.json.encode(own, order="deterministic")).hex()
+    return checksum(msgspec.json.encode(written_keys, order="deterministic")).hex()
 
 
 def restore_files(path: Path, create: Callable[[Path], None], files: Mapping[str, str]) -> list[str]:
-    """Write damaged files again; return a sentence on each.
+    """Write damaged files again, and return a sentence about each.
 
     Parameters
     ----------
@@ -162,41 +164,42 @@ def restore_files(path: Path, create: Callable[[Path], None], files: Mapping[str
     Raises
     ------
     InputError
-        This version of Zarr writes another file; a file cannot be written.
+        This version of Zarr writes a different file, or a file cannot be written.
     """
-    damaged = [key for key, wanted in files.items() if checksum_file(path / key).hex() != wanted]
+    damaged = [key for key, expected in files.items() if checksum_file(path / key).hex() != expected]
     if not damaged:
         return []
-    said = [f"{key} {describe_damage(path / key)}" for key in damaged]
+    sentences = [f"{key} {describe_damage(path / key)}" for key in damaged]
     with temporary_folder() as folder:
         create(folder)
-        for key, says in zip(damaged, said, strict=True):
+        for key, sentence in zip(damaged, sentences, strict=True):
             if checksum_file(folder / key).hex() != files[key]:
-                raise InputError(f"{path}/{says}; remove {path}, or choose another DIR")
+                raise InputError(f"{path}/{sentence}; remove {path}, or choose another DIR")
         _copy(folder, path, damaged)
-    return said
+    return sentences
 
 
 def convert_files(path: Path, create: Callable[[int], Callable[[Path], None]]) -> Callable[[], None]:
-    """Write all files but the group's own document as this version has them; return what writes that as well.
+    """Write all constant files in the present format, except the group's document; return the function that writes it.
 
     Parameters
     ----------
     path : Path
         A store of an earlier version.
     create : callable
-        Gives for a chunk's length a function that creates the same store in an empty folder.
+        Takes the number of members in a chunk, and returns a function that creates the store in an empty folder.
 
     Raises
     ------
     InputError
-        The chunk's length is unknown because the document of the status is damaged; a file cannot be written.
+        The document of the status, which contains the number of members in a chunk, is damaged, or a file cannot be
+        written.
     """
     import zarr
 
     try:
         chunk = zarr.open_array(path / STATUS_NAME, mode="r", zarr_format=3).chunks[0]
-    except Exception as error:  # whatever a damaged document makes Zarr raise
+    except Exception as error:  # a damaged document may make Zarr raise anything
         file = path / STATUS_NAME / DOCUMENT
         raise InputError(
             f"{file}: cannot be read ({type(error).__name__}); remove {path}, or choose another DIR"
@@ -222,17 +225,16 @@ def _copy(source: Path, to: Path, keys: Iterable[str]) -> None:
 
 def create_arrays(group: Any, members: Members, count: int, chunk: int) -> None:
     """Create the arrays of a group, with labels and units."""
-    labels = {name: found for name, found in members.outputs.labels.items() if _is_used(name, members)}
-    for name, found in labels.items():
-        place = group.create_array(name, shape=(len(found),), dtype=str, dimension_names=(name,))
-        place[:] = np.array(found, dtype=np.dtypes.StringDType())
+    for name, labels in members.outputs.labels.items():
+        if _is_used(name, members):
+            _create_labels(group, name, name, labels)
     if _is_used("time", members):
-        place = group.create_array(
+        times = group.create_array(
             "time", shape=(len(members.instants),), dtype="f8", dimension_names=("time",), attributes={"units": "s"}
         )
-        place[:] = members.instants
-    every = dict.fromkeys(members.names, ((), ())) | members.shapes
-    for name, (dims, shape) in every.items():
+        times[:] = members.instants
+    shapes = dict.fromkeys(members.names, ((), ())) | members.shapes
+    for name, (dims, shape) in shapes.items():
         group.create_array(
             array_name(name), shape=(count, *shape), chunks=(chunk, *shape), dtype="f8", fill_value=np.nan,
             dimension_names=("member", *dims), attributes={"is": "variable" if name in members.names else "output"},
@@ -240,7 +242,7 @@ def create_arrays(group: Any, members: Members, count: int, chunk: int) -> None:
     group.create_array(
         MESSAGE_NAME, shape=(count,), chunks=(chunk,), dtype=str, dimension_names=("member",), fill_value=""
     )
-    _say_units(group, members)
+    _set_units(group, members)
     flags = {"flag_values": list(range(len(STATUS))), "flag_meanings": " ".join(STATUS)}
     group.create_array(
         STATUS_NAME, shape=(count,), chunks=(chunk,), dtype="u1", dimension_names=("member",),
@@ -248,25 +250,28 @@ def create_arrays(group: Any, members: Members, count: int, chunk: int) -> None:
     )  # fmt: skip
 
 
-def _say_units(group: Any, members: Members) -> None:
+def _create_labels(group: Any, name: str, dimension: str, labels: Sequence[str]) -> None:
+    array = group.create_array(name, shape=(len(labels),), dtype=str, dimension_names=(dimension,))
+    array[:] = np.array(labels, dtype=np.dtypes.StringDType())
+
+
+def _set_units(group: Any, members: Members) -> None:
     """Set the unit of each array; arrays with mixed units get a coordinate that has one for each component."""
-    beside = []
+    unit_coordinates = []
     for name, units in members.units.items():
         array = group[array_name(name)]
         if joined(units):
             array.attrs["units"] = joined(units)
         if len(set(units)) > 1:
-            beside.append(units_beside(name))
-            dimension = members.shapes[name][0][0]
-            place = group.create_array(beside[-1], shape=(len(units),), dtype=str, dimension_names=(dimension,))
-            place[:] = np.array(units, dtype=np.dtypes.StringDType())
-    if beside:
-        group.attrs["coordinates"] = " ".join(beside)  # what xarray takes for coordinates, not data
+            unit_coordinates.append(unit_coordinate_name(name))
+            _create_labels(group, unit_coordinates[-1], members.shapes[name][0][0], units)
+    if unit_coordinates:
+        group.attrs["coordinates"] = " ".join(unit_coordinates)  # xarray reads these as coordinates, not as data
 
 
 def require_free_names(members: Members) -> None:
-    """Refuse outputs that are called like something else in the store."""
-    taken = {
+    """Refuse outputs whose names are reserved or cannot be names of arrays (InputError)."""
+    reserved = {
         STATUS_NAME,
         MESSAGE_NAME,
         CHECKSUMS,
@@ -275,14 +280,14 @@ def require_free_names(members: Members) -> None:
         *members.outputs.labels,
         *map(array_name, members.names),
     }
-    taken |= {units_beside(name) for name, units in members.units.items() if len(set(units)) > 1}
+    reserved |= {unit_coordinate_name(name) for name, units in members.units.items() if len(set(units)) > 1}
     for name in members.shapes:
         key = array_name(name)
-        if key in taken:
+        if key in reserved:
             raise InputError(f"outputs: {name!r} is taken; choose another name")
         if key in ("", ".", "..", "zarr.json") or key.startswith("__") or "\0" in key:
-            raise InputError(f"outputs: {name!r} can be no array's name in Zarr; choose another name")
-        taken.add(key)
+            raise InputError(f"outputs: {name!r} cannot be the name of an array in Zarr; choose another name")
+        reserved.add(key)
 
 
 def _is_used(dimension: str, members: Members) -> bool:
@@ -290,10 +295,10 @@ def _is_used(dimension: str, members: Members) -> bool:
 
 
 def array_name(name: str) -> str:
-    """Return what a variable or an output is called in the store: a slash would make groups of it."""
+    """Return the name of a variable or output in the store, where a slash would create groups."""
     return name.replace("/", "_")
 
 
-def units_beside(name: str) -> str:
-    """Return what the coordinate with the units of an output's components is called: one word."""
+def unit_coordinate_name(name: str) -> str:
+    """Return the name, without spaces, of the coordinate with the units of an output's components."""
     return f"{'_'.join(array_name(name).split())}_unit"

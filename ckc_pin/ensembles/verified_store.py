@@ -1,4 +1,4 @@
-"""Results of an ensemble as xarray reads them: every file is compared with its checksum."""
+"""A Zarr store that compares every file with its checksum when it is read."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ __all__ = ["VerifiedStore", "open_verified"]
 
 
 def open_verified(checksums: ChunkChecksums, files: Mapping[str, str]) -> VerifiedStore:
-    """Open a store whose members have all ended.
+    """Open a finished store for reading.
 
     Parameters
     ----------
     checksums : ChunkChecksums
     files : mapping of str to str
-        Checksums of the files that are no chunks of members.
+        Checksums of the files that are not chunks of members.
     """
     rows = checksums.read()
-    for k, row in enumerate(rows):  # in the table it is of the statuses themselves
+    for k, row in enumerate(rows):  # the table has the checksum of the statuses instead of their file's
         row[0] = np.frombuffer(checksum_file(checksums.path / checksums.key(k, 0)), np.uint8)
     columns = {name: column for column, name in enumerate(checksums.names)}
     return VerifiedStore(LocalStore(checksums.path, read_only=True), columns, rows, files)
 
 
 class VerifiedStore(WrapperStore[LocalStore]):
-    """A finished store for reading: a file that is damaged or removed meanwhile raises InputError when it is read.
+    """A finished store for reading. Reading a file that was damaged or removed raises InputError.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class VerifiedStore(WrapperStore[LocalStore]):
         return VerifiedStore(store, self._columns, self._rows, self._files)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Read a file (InputError where its checksum differs)."""
+        """Read a file (InputError if its checksum is wrong)."""
         data = await super().get(key, prototype, byte_range)
         expected = self._expected(key)
         if expected is not None and expected != (NO_FILE if data is None else checksum(data.to_bytes())):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
-from ckc_pin.ensembles.store_layout import array_name, units_beside
+from ckc_pin.ensembles.store_layout import array_name, unit_coordinate_name
 from ckc_pin.view import style
 from ckc_pin.view.layout import fit_legend, legend_line, set_panel_title, write_figure
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, figure_style
@@ -54,7 +54,7 @@ def draw_quantiles(x: xr.DataArray, path: Path) -> Path:
     has_components = len(x.dims) > 2
     components = x[x.dims[1]].to_numpy() if has_components else ()
     labels = [coordinate_symbol(str(label)) for label in components] or [escape_mathtext(name)]
-    component_units = x.coords.get(units_beside(name))
+    component_units = x.coords.get(unit_coordinate_name(name))
     if component_units is None:
         units = [x.attrs.get("units", "")] * values.shape[1]
     else:

@@ -2,7 +2,7 @@
 
 What goes in is measured here: members a second of a core, what a task costs Dask's scheduler, what writing a chunk
 takes. Workers ask for the next chunk when they have finished one; the scheduler serves one at a time, and so does the
-client, which fetches and writes results. AHEAD chunks a worker are on their way, as in `ensembles.cluster`.
+client, which fetches and writes results. CHUNKS_PER_WORKER chunks a worker are on their way, as in `ensembles.cluster`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ckc_pin.ensembles.cluster import AHEAD
+from ckc_pin.ensembles.cluster import CHUNKS_PER_WORKER
 from ckc_pin.ensembles.members import Chunk, Members
 from ckc_pin.ensembles.store import Store
 
@@ -47,7 +47,7 @@ def simulated(costs: Costs, cores: int, chunk: int, members: int = MEMBERS) -> t
     end = 0.0
     while left:
         free, k = heapq.heappop(idle)
-        asked = free if sent < AHEAD * cores else max(free, written[sent - AHEAD * cores])
+        asked = free if sent < CHUNKS_PER_WORKER * cores else max(free, written[sent - CHUNKS_PER_WORKER * cores])
         scheduler = max(scheduler, asked) + costs.task
         done = scheduler + work
         client = max(client, done) + write

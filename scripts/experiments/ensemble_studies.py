@@ -10,9 +10,9 @@ import numpy as np
 import ckc_pin
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.sources import Sources
-from ckc_pin.ensembles.importance import importance
-from ckc_pin.ensembles.spec import sweep_of
-from ckc_pin.ensembles.task import SweepTask
+from ckc_pin.ensembles.members import SweepTask
+from ckc_pin.ensembles.sobol_indices import compute_sobol_indices
+from ckc_pin.ensembles.spec import parse_sweep
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.view.ensemble_figures import draw_basins, draw_quantiles, draw_sobol_indices
 from scripts.experiments.certificate.certificate import certify, rest_height, sublevel_set
@@ -54,8 +54,8 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
         lines.append(f"| {name} | {nominal_rms:.2e} | {float(most.quantile(0.95)):.2e}, {float(most.max()):.2e} |")
     data = {"scene": "five_bar/tracking", "variables": variables, "outputs": {"late": "theta_1"}, "seed": 1,
             "members": members, "overrides": dict(TRACKING)}  # fmt: skip
-    weighed = importance(
-        SweepTask(sweep_of(data, Sources("study", Path())), "study", "five_bar/tracking", None), weighed_by
+    weighed = compute_sobol_indices(
+        SweepTask(parse_sweep(data, Sources("study", Path())), "study", "five_bar/tracking", None), weighed_by
     )
     draw_sobol_indices(weighed.sel(output="late"), out / "tolerances_importance.png")
     lines += ["", "| length | first order | total |", "|---|---|---|"]

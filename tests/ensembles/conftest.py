@@ -1,4 +1,4 @@
-"""Terms that an ensemble compiles go to a cache that other tests do not see."""
+"""Give ensembles a cache of compiled terms that is separate from other tests."""
 
 from __future__ import annotations
 

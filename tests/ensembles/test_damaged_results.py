@@ -1,4 +1,4 @@
-"""Damaged files in an ensemble's results: found by checksums, and their members computed again."""
+"""Damaged files in an ensemble's store are detected by checksums, and their members are computed again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import ckc_pin
 from ckc_pin.ensembles.members import Members
 from ckc_pin.errors import InputError
 from tests.contract.helpers.command import ckc
-from tests.ensembles.test_sweep import results, written
+from tests.ensembles.test_sweep import open_results, write_sweep
 
 VARIABLES = {"initial.q.theta_1": {"uniform": [-1.9, -0.9]}}
 OUTPUTS: dict[str, Any] = {"end": "q_tree", "path": {"of": "theta_1", "reduce": "trajectory"}, "drift": "energy_drift"}
@@ -42,7 +42,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def convert_to_format_1(store: Path) -> None:
-    """Make a store what an earlier version wrote: without checksums."""
+    """Convert a store to the format of an earlier version, without checksums."""
     rmtree(store / "checksums")
     document = json.loads((store / "zarr.json").read_text())
     del document["attributes"]["checksum"]
@@ -73,15 +73,15 @@ def flip_a_bit(file: Path) -> None:
 def test_members_of_a_damaged_chunk_are_computed_again(
     finished: Path, tmp_path: Path, name: str, damage: Callable[[Path], None]
 ) -> None:
-    expected = results(finished)
+    expected = open_results(finished)
     store = copytree(finished, tmp_path / "o") / "results.zarr"
     damage(store / name)
     verb = "missing" if damage is delete else "damaged"
-    with pytest.warns(UserWarning, match="computed again") as said:
-        found = ensemble(tmp_path / "o").load()
-    assert [str(each.message) for each in said] == [f"{store}: computed again: members 5 to 9 ({name} is {verb})"]
-    assert found.identical(expected)
-    assert ensemble(tmp_path / "o").load().identical(expected), "repaired, and therefore without a warning"
+    with pytest.warns(UserWarning, match="computed again") as caught:
+        reopened = ensemble(tmp_path / "o").load()
+    assert [str(each.message) for each in caught] == [f"{store}: computed again: members 5 to 9 ({name} is {verb})"]
+    assert reopened.identical(expected)
+    assert ensemble(tmp_path / "o").load().identical(expected), "a repaired store gives no warning"
 
 
 @pytest.mark.parametrize("damage", [delete, truncate, empty, flip_a_bit])
@@ -93,15 +93,15 @@ def test_damaged_files_that_follow_from_the_sweep_are_written_again(
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
     damage(store / name)
     verb = "missing" if damage is delete else "damaged"
-    with pytest.warns(UserWarning, match="written again") as said:
+    with pytest.warns(UserWarning, match="written again") as caught:
         ensemble(tmp_path / "o")
-    assert [str(each.message) for each in said] == [f"{store}: written again: {name} is {verb}"]
+    assert [str(each.message) for each in caught] == [f"{store}: written again: {name} is {verb}"]
     assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("damage", [delete, truncate, empty, flip_a_bit])
 @pytest.mark.parametrize("name", ["zarr.json", "checksums/zarr.json"])
-def test_a_store_without_sound_attributes_is_refused(
+def test_a_store_with_damaged_attributes_is_rejected(
     finished: Path, tmp_path: Path, name: str, damage: Callable[[Path], None]
 ) -> None:
     store = copytree(finished, tmp_path / "o") / "results.zarr"
@@ -113,20 +113,22 @@ def test_a_store_without_sound_attributes_is_refused(
 
 
 def test_random_damages_never_change_results(finished: Path, tmp_path: Path) -> None:
-    expected = results(finished)
+    expected = open_results(finished)
     files = sorted(path.relative_to(finished) for path in finished.rglob("*") if path.is_file())
     draw, refusals = random.Random(7), []
     for _ in range(DAMAGES):
         folder = copytree(finished, tmp_path / "o", dirs_exist_ok=True)
-        said = [damage_at_random(folder, files, draw) for _ in range(draw.choice([1, 1, 2]))]
+        damages = [damage_at_random(folder, files, draw) for _ in range(draw.choice([1, 1, 2]))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             try:
-                assert ensemble(folder).load().identical(expected), said
+                assert ensemble(folder).load().identical(expected), damages
             except InputError as error:
                 refusals.append(str(error))
         rmtree(folder)
-    assert all("zarr.json: " in refusal for refusal in refusals), "only for the two documents with attributes"
+    assert all("zarr.json: " in refusal for refusal in refusals), (
+        "only the two documents with attributes cannot be repaired"
+    )
     assert len(refusals) < DAMAGES / 4
 
 
@@ -152,14 +154,14 @@ def damage_at_random(folder: Path, files: list[Path], draw: random.Random) -> st
 def test_damage_after_the_ensemble_is_an_input_error_when_values_are_read(finished: Path, tmp_path: Path) -> None:
     for k, damage in enumerate((delete, truncate, empty, flip_a_bit)):
         store = copytree(finished, tmp_path / str(k)) / "results.zarr"
-        found = ensemble(tmp_path / str(k))
+        reopened = ensemble(tmp_path / str(k))
         damage(store / "end/c/1/0")
         with pytest.raises(InputError, match=r"end/c/1/0 is (missing|damaged); run the same sweep again"):
-            found.load()
-        assert np.isfinite(found["drift"].to_numpy()).all()
+            reopened.load()
+        assert np.isfinite(reopened["drift"].to_numpy()).all()
 
 
-def test_a_store_that_cannot_be_repaired_is_refused(finished: Path, tmp_path: Path) -> None:
+def test_a_store_that_cannot_be_repaired_is_rejected(finished: Path, tmp_path: Path) -> None:
     store = copytree(finished, tmp_path / "o") / "results.zarr"
     delete(store / "end/c/1/0")
     (store / "end/c/1/0").mkdir()
@@ -179,14 +181,14 @@ def test_damaged_members_are_pending_until_they_are_computed(
     monkeypatch.setattr(Members, "run", interrupt)
     with pytest.warns(UserWarning, match="members 5 to 9"), pytest.raises(KeyboardInterrupt):
         ensemble(tmp_path / "o")
-    assert results(tmp_path / "o")["status"].to_numpy().tolist() == [1] * 5 + [0] * 5 + [1] * 3
+    assert open_results(tmp_path / "o")["status"].to_numpy().tolist() == [1] * 5 + [0] * 5 + [1] * 3
 
 
 def test_results_of_an_earlier_version_get_checksums(finished: Path, tmp_path: Path) -> None:
-    expected = results(finished)
+    expected = open_results(finished)
     store = copytree(finished, tmp_path / "o") / "results.zarr"
     convert_to_format_1(store)
-    assert ensemble(tmp_path / "o").load().identical(expected), "all members stay, and therefore without a warning"
+    assert ensemble(tmp_path / "o").load().identical(expected), "all members are kept, without a warning"
     convert_to_format_1(store)
     delete(store / "end/c/0/0")
     truncate(store / "status/c/1")
@@ -196,11 +198,11 @@ def test_results_of_an_earlier_version_get_checksums(finished: Path, tmp_path: P
     assert ensemble(tmp_path / "o").load().identical(expected)
 
 
-def test_sweep_says_in_one_line_which_members_it_computes_again(tmp_path: Path) -> None:
-    path, out = written(tmp_path, 30), tmp_path / "o"
+def test_sweep_prints_in_one_line_which_members_it_computes_again(tmp_path: Path) -> None:
+    path, out = write_sweep(tmp_path, 30), tmp_path / "o"
     command = ("sweep", str(path), "--out", str(out), "--chunk", "5", "--no-figures", "--json")
     assert ckc(*command).err == ""
-    expected = results(out)
+    expected = open_results(out)
     for k in range(5):
         delete(out / f"results.zarr/end/c/{k}/0")
     done = ckc(*command)
@@ -210,4 +212,4 @@ def test_sweep_says_in_one_line_which_members_it_computes_again(tmp_path: Path) 
         "missing), members 10 to 14 (end/c/2/0 is missing) and 2 more"
     ]
     assert done.json["done"] == 30
-    assert results(out).identical(expected)
+    assert open_results(out).identical(expected)

@@ -1,4 +1,4 @@
-"""Ctrl-C keeps what is there, and says so."""
+"""Interrupted sweeps keep finished members and leave no temporary files or processes."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ import pytest
 import ckc_pin
 from ckc_pin.base.atomic_files import temporary_folder
 from ckc_pin.base.interrupt import uninterrupted_thread
-from ckc_pin.ensembles import cluster, members, store_layout, worst
-from ckc_pin.ensembles.ensemble import run_sweep, sweep_task
-from tests.ensembles.test_sweep import results, written
+from ckc_pin.ensembles import cluster, members, store_layout
+from ckc_pin.ensembles.ensemble import load_sweep_task, run_sweep, save_worst_members
+from tests.ensembles.test_sweep import open_results, write_sweep
 
 
-def test_ctrl_c_keeps_what_is_there(tmp_path: Path) -> None:
-    path, out = written(tmp_path, members=2000, t_end=2.0), tmp_path / "o"
+def test_ctrl_c_keeps_finished_members(tmp_path: Path) -> None:
+    path, out = write_sweep(tmp_path, members=2000, t_end=2.0), tmp_path / "o"
     command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--chunk", "5", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
@@ -33,13 +33,13 @@ def test_ctrl_c_keeps_what_is_there(tmp_path: Path) -> None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    said, errors = process.communicate(timeout=60)
-    found = json.loads(said)
+    printed, errors = process.communicate(timeout=60)
+    data = json.loads(printed)
     assert process.returncode == 130, errors
-    assert found["status"] == "interrupted"
-    assert "the same command goes on from it" in errors
+    assert data["status"] == "interrupted"
+    assert "the same command resumes the sweep" in errors
     assert "Traceback" not in errors
-    assert 10 <= found["done"] == int((results(out)["status"] == 1).sum()) < 2000
+    assert 10 <= data["done"] == int((open_results(out)["status"] == 1).sum()) < 2000
 
 
 def interrupt_first(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -78,11 +78,11 @@ def test_a_temporary_folder_is_removed_when_its_creation_is_interrupted(
 
 
 def test_a_store_that_is_interrupted_while_created_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The files are written in another thread, which must not go on after the removal."""
+    """The files are written in another thread, which must not continue after the removal."""
     monkeypatch.setattr(store_layout, "create_arrays", interrupt_first(store_layout.create_arrays))
     out = tmp_path / "o"
     with pytest.raises(KeyboardInterrupt):
-        run_sweep(sweep_task(written(tmp_path)), out)
+        run_sweep(load_sweep_task(write_sweep(tmp_path)), out)
     assert not list(out.iterdir())
 
 
@@ -93,13 +93,13 @@ def interrupted_rows(*_: Any) -> tuple[None, str, str]:
 def test_an_interrupt_of_the_run_that_measures_the_work_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(members, "run_rows", interrupted_rows)
+    monkeypatch.setattr(members, "record_rows", interrupted_rows)
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
-        run_sweep(sweep_task(written(tmp_path)), tmp_path / "o")
+        run_sweep(load_sweep_task(write_sweep(tmp_path)), tmp_path / "o")
 
 
 def test_an_interrupt_of_the_run_that_finds_shapes_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(members, "run_rows", interrupted_rows)
+    monkeypatch.setattr(members, "record_rows", interrupted_rows)
     with pytest.raises(KeyboardInterrupt, match="SIGTERM"):
         ckc_pin.ensemble(
             "five_bar/swing", {"initial.q.theta_1": [-1.5]}, {"end": lambda run: run.t[-1]},
@@ -108,12 +108,12 @@ def test_an_interrupt_of_the_run_that_finds_shapes_is_not_lost(monkeypatch: pyte
 
 
 def test_an_interrupted_run_of_a_worst_member_is_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    summary = run_sweep(sweep_task(written(tmp_path, 4)), tmp_path / "o")
+    result = run_sweep(load_sweep_task(write_sweep(tmp_path, 4)), tmp_path / "o")
     run = ckc_pin.simulate("five_bar/swing", {"t_end": 0.1})
     object.__setattr__(run, "status", "interrupted")
-    monkeypatch.setattr(worst, "simulate", lambda *_: run)
+    monkeypatch.setattr("ckc_pin.ensembles.ensemble.simulate", lambda *_: run)
     with pytest.raises(KeyboardInterrupt):
-        worst.save_worst(summary.prepared, results(tmp_path / "o"), "drift", tmp_path / "o")
+        save_worst_members(result.prepared, open_results(tmp_path / "o"), "drift", tmp_path / "o")
     assert not list((tmp_path / "o").glob("worst_*"))
 
 
@@ -121,7 +121,7 @@ def test_a_cluster_that_is_interrupted_while_it_starts_leaves_nothing(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "_start", interrupt_first(cluster._start))
-    with pytest.raises(KeyboardInterrupt), cluster.client_of(None, 1):
+    with pytest.raises(KeyboardInterrupt), cluster.connect(None, 1):
         pass
     assert not multiprocessing.active_children()
     assert not list(temporary.iterdir())
@@ -132,7 +132,7 @@ def sigint_is_blocked() -> bool:
 
 
 def test_ctrl_c_does_not_reach_workers() -> None:
-    with cluster.client_of(None, 1) as client:
+    with cluster.connect(None, 1) as client:
         assert list(client.run(sigint_is_blocked).values()) == [True]
     assert not sigint_is_blocked()
 

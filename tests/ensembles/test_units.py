@@ -1,4 +1,4 @@
-"""Units of results: of variables and outputs, of components where they differ, and on the axes of figures."""
+"""Units of variables and outputs in an ensemble's results and on the axes of figures."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ VARIABLES: dict[str, Any] = {"link.rod_link.mass": [0.2, 0.3], "spring.0.stiffne
 OUTPUTS: dict[str, Any] = {
     "end": "q_tree", "path": {"of": "v_tree", "reduce": "trajectory"}, "tau": "tau", "u": "u", "worst": "max_abs_tau",
     "mean": {"of": "error", "reduce": "integral"}, "way": {"of": "slider", "reduce": "max_abs"},
-    "drift": "energy_drift", "own": lambda run: run.t[-1],
+    "drift": "energy_drift", "function": lambda run: run.t[-1],
 }  # fmt: skip
 
 
@@ -110,20 +110,20 @@ def ensemble(scene: Path, **rest: Any) -> xr.Dataset:
     return ckc_pin.ensemble(scene, VARIABLES, OUTPUTS, progress=False, **rest)
 
 
-def test_every_number_that_has_a_name_has_its_unit(scene: Path) -> None:
+def test_every_named_parameter_has_a_unit(scene: Path) -> None:
     mechanism = ckc_pin.load(scene.parent / "mechanism.toml")
-    known = with_components(values_of(mechanism.spec, mechanism.urdf))
-    assert set(PARAMETERS) <= set(known)
-    found = {name: key_unit(mechanism, name) for name in [*PARAMETERS, *KEYS]}
-    # a motor that turns a hinge and one that pushes a slide: what is of both has both
-    assert found == {**PARAMETERS, **KEYS, "controller.drive.torque_rate": "N m/s or N/s"}
-    assert [name for name in known if not key_unit(mechanism, name) and not name.endswith(".ratio")] == []
+    present = with_components(values_of(mechanism.spec, mechanism.urdf))
+    assert set(PARAMETERS) <= set(present)
+    units = {name: key_unit(mechanism, name) for name in [*PARAMETERS, *KEYS]}
+    # one motor drives a hinge and the other one a slide, so the rate has two units
+    assert units == {**PARAMETERS, **KEYS, "controller.drive.torque_rate": "N m/s or N/s"}
+    assert [name for name in present if not key_unit(mechanism, name) and not name.endswith(".ratio")] == []
 
 
-def test_units_are_those_of_the_reference(scene: Path) -> None:
+def test_units_match_the_reference(scene: Path) -> None:
     mechanism = ckc_pin.load(scene.parent / "mechanism.toml")
     entries = {"joint": "joint.crank", "spring": "spring.1", "force": "force.0", "motor": "motor.crank"}
-    seen = 0
+    compared = 0
     for file in ("mechanism", "scene"):
         for table in keys.tables(file):
             path = entries.get(table.path, "" if file == "mechanism" else table.path)
@@ -131,32 +131,32 @@ def test_units_are_those_of_the_reference(scene: Path) -> None:
                 if key.unit and (path or file == "scene"):
                     unit = key_unit(mechanism, f"{path}.{key.name}".lstrip("."))
                     assert set(unit.split(" or ")) <= {*key.unit.split(", "), ""}, key.name
-                    seen += bool(unit)
-    assert seen > 25
+                    compared += bool(unit)
+    assert compared > 25
 
 
 def test_variables_and_outputs_have_units_of_their_components(scene: Path, tmp_path: Path) -> None:
     ensemble(scene, out=tmp_path)
-    found = xr.open_zarr(tmp_path / "results.zarr", consolidated=False).load()
-    assert {name: x.attrs.get("units") for name, x in found.data_vars.items()} == {
+    results = xr.open_zarr(tmp_path / "results.zarr", consolidated=False).load()
+    assert {name: x.attrs.get("units") for name, x in results.data_vars.items()} == {
         "link.rod_link.mass": "kg", "spring.0.stiffness": "N/m", "end": "rad or m", "path": "rad/s or m/s",
-        "tau": "N m or N", "u": "N m", "worst": "N m or N", "mean": "rad s", "way": "m", "drift": "J", "own": None,
+        "tau": "N m or N", "u": "N m", "worst": "N m or N", "mean": "rad s", "way": "m", "drift": "J", "function": None,
         "status": None, "message": None,
     }  # fmt: skip
-    assert found["time"].attrs["units"] == "s"
-    assert found["end"].end_unit.to_series().to_dict() == {"crank": "rad", "rod": "rad", "slider": "m"}
-    assert found["path"].sel(coordinate="slider").path_unit.item() == "m/s"
-    assert found["tau"].tau_unit.to_series().to_dict() == {"crank": "N m", "push": "N"}
-    assert "u_unit" not in found.coords
+    assert results["time"].attrs["units"] == "s"
+    assert results["end"].end_unit.to_series().to_dict() == {"crank": "rad", "rod": "rad", "slider": "m"}
+    assert results["path"].sel(coordinate="slider").path_unit.item() == "m/s"
+    assert results["tau"].tau_unit.to_series().to_dict() == {"crank": "N m", "push": "N"}
+    assert "u_unit" not in results.coords
 
 
-def test_a_store_that_was_begun_without_units_is_gone_on_with(scene: Path, tmp_path: Path) -> None:
-    whole = ensemble(scene, out=tmp_path).load()
+def test_a_store_without_units_is_resumed(scene: Path, tmp_path: Path) -> None:
+    expected = ensemble(scene, out=tmp_path).load()
     store = tmp_path / "results.zarr"
     convert_to_format_1(store)
     for file in store.rglob("zarr.json"):
         data = json.loads(file.read_text())
-        if file.parent.name not in ("time", store.name):  # these always had them
+        if file.parent.name not in ("time", store.name):  # these always had units
             data["attributes"].pop("units", None)
         data["attributes"].pop("coordinates", None)
         file.write_text(json.dumps(data))
@@ -168,11 +168,11 @@ def test_a_store_that_was_begun_without_units_is_gone_on_with(scene: Path, tmp_p
     bare = xr.open_zarr(store, consolidated=False).load()
     assert bare["status"].to_numpy().tolist() == [0] * 4
     assert "units" not in bare["end"].attrs
-    again = ensemble(scene, out=tmp_path).load()
-    assert again.identical(whole)
+    resumed = ensemble(scene, out=tmp_path).load()
+    assert resumed.identical(expected)
 
 
-def test_an_output_called_as_units_are_is_refused(scene: Path) -> None:
+def test_an_output_with_the_name_of_a_unit_coordinate_is_rejected(scene: Path) -> None:
     with pytest.raises(ckc_pin.InputError, match="'end_unit' is taken"):
         ckc_pin.ensemble(scene, VARIABLES, {"end": "q_tree", "end_unit": "u"}, progress=False)
 
@@ -190,7 +190,9 @@ def test_figures_have_units_on_their_axes(scene: Path, tmp_path: Path, monkeypat
         "spring.0.stiffness (N/m)",
     ]
     assert over.axes[1].get_ylabel() == "way (m)"
-    turned = ckc_pin.ensemble(scene, dict(reversed(VARIABLES.items())), {"way": OUTPUTS["way"]}, progress=False)
-    ensemble_figures.draw_ensemble(turned, tmp_path)
-    assert figures["way"].axes[0].get_xlabel() == "spring.0.stiffness (N/m)", "the variable that is named first"
+    reversed_results = ckc_pin.ensemble(
+        scene, dict(reversed(VARIABLES.items())), {"way": OUTPUTS["way"]}, progress=False
+    )
+    ensemble_figures.draw_ensemble(reversed_results, tmp_path)
+    assert figures["way"].axes[0].get_xlabel() == "spring.0.stiffness (N/m)", "the first variable is on the x axis"
     assert np.all(np.isfinite(over.axes[0].collections[0].get_array()))

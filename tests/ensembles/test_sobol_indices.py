@@ -1,4 +1,4 @@
-"""Sobol indices against a mechanism whose answer is known: what gravity, mass and inertia do to a pendulum's energy."""
+"""Sobol indices of a pendulum's energy, which is linear in gravity."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ckc_pin.ensembles.ensemble import sweep_task
-from ckc_pin.ensembles.importance import importance
+from ckc_pin.ensembles.ensemble import load_sweep_task
+from ckc_pin.ensembles.sobol_indices import compute_sobol_indices
 from ckc_pin.errors import InputError
 from tests.contract.helpers.command import ckc
 from tests.contract.test_parameters import folder
@@ -27,7 +27,7 @@ energy = "energy"
 """
 
 
-def written(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
+def write_sweep(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
     folder(at / "own")
     path = at / "own.sweep.toml"
     path.write_text(FILE.format(epsilon=epsilon).replace("[overrides]", "members = 2\n[overrides]"))
@@ -35,10 +35,10 @@ def written(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
 
 
 def test_energy_at_rest_is_linear_in_gravity(tmp_path: Path) -> None:
-    task = sweep_task(written(tmp_path))
-    found = importance(task, 64, 2)
-    # E = c - sum of m g . p, so that the shares are as (p_x 1)^2 to (p_y 2)^2
-    members = task.members(1)
+    task = load_sweep_task(write_sweep(tmp_path))
+    found = compute_sobol_indices(task, 64, 2)
+    # E = c - sum of m g . p, so the shares have the ratio (p_x 1)^2 : (p_y 2)^2
+    members = task.prepare(1)
     energy = members.run(0, np.array([[0, 0, 0.1], [1, 0, 0.1], [0, 1, 0.1]])).outputs["energy"]
     parts = np.array([energy[1] - energy[0], 2 * (energy[2] - energy[0]), 0.0]) ** 2
     for order in ("first_order", "total_order"):
@@ -46,8 +46,8 @@ def test_energy_at_rest_is_linear_in_gravity(tmp_path: Path) -> None:
     assert float(found["total_order"].sel(output="energy", variable="epsilon")) == pytest.approx(0, abs=1e-9)
 
 
-def test_the_command_writes_them(tmp_path: Path) -> None:
-    done = ckc("sweep", str(written(tmp_path)), "--out", str(tmp_path / "o"), "--indices", "4", "--json")
+def test_the_command_writes_indices_and_a_figure(tmp_path: Path) -> None:
+    done = ckc("sweep", str(write_sweep(tmp_path)), "--out", str(tmp_path / "o"), "--indices", "4", "--json")
     assert done.code == 0, done.err
     assert len((tmp_path / "o" / "indices.csv").read_text().splitlines()) == 4
     assert (tmp_path / "o" / "indices_energy.png").stat().st_size > 1000
@@ -55,25 +55,23 @@ def test_the_command_writes_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("epsilon", "count", "says"),
-    [("uniform = [0.1, 0.2]", 6, "no power of 2"), ("list = [0.1]", 4, "no random variable")],
+    [("uniform = [0.1, 0.2]", 6, "not a power of 2"), ("list = [0.1]", 4, "not random")],
 )
-def test_what_has_no_variance_is_refused(tmp_path: Path, epsilon: str, count: int, says: str) -> None:
+def test_counts_and_variables_without_indices_are_rejected(tmp_path: Path, epsilon: str, count: int, says: str) -> None:
     with pytest.raises(InputError, match=says):
-        importance(sweep_task(written(tmp_path, epsilon)), count, 1)
+        compute_sobol_indices(load_sweep_task(write_sweep(tmp_path, epsilon)), count, 1)
 
 
 @pytest.mark.parametrize(
-    ("left_out", "count", "says"),
+    ("omitted", "count", "says"),
     [
-        ('"gravity', "4", "epsilon alone makes all of the variance; vary something beside it"),
-        ("none", "6", "6 is no power of 2, which Saltelli's design needs"),
+        ('"gravity', "4", "epsilon is the only variable; add at least one more"),
+        ("none", "6", "6 is not a power of 2, which Saltelli's design needs"),
     ],
 )
-def test_what_has_no_indices_is_refused_before_anything_is_run(
-    tmp_path: Path, left_out: str, count: str, says: str
-) -> None:
-    path, out = written(tmp_path), tmp_path / "o"
-    path.write_text("\n".join(line for line in path.read_text().splitlines() if not line.startswith(left_out)))
+def test_indices_are_checked_before_anything_is_run(tmp_path: Path, omitted: str, count: str, says: str) -> None:
+    path, out = write_sweep(tmp_path), tmp_path / "o"
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if not line.startswith(omitted)))
     done = ckc("sweep", str(path), "--out", str(out), "--indices", count, "--json")
     assert done.code == 2
     assert done.json["message"] == f"indices: {says}"
