@@ -1,4 +1,4 @@
-"""URDF files, from strangers, to one Pinocchio model.
+"""Read URDF files, which are untrusted input, into one Pinocchio model.
 
 XML is parsed strictly by expat, document types (and with them entities) are refused, and what
 Pinocchio would accept in silence is checked here: negative or NaN masses, zero axes, duplicate names,

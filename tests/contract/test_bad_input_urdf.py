@@ -1,4 +1,4 @@
-"""URDFs from strangers: what urdfdom and Pinocchio would take in silence is refused here, by name."""
+"""URDFs as untrusted input: values that urdfdom and Pinocchio accept silently are refused with their name."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def test_signals_while_saving_leave_a_complete_file(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.npz", "scene.json"], "no figures, nothing half"
 
 
-# --- files of strangers --------------------------------------------------------------------------
+# --- untrusted files -----------------------------------------------------------------------------
 
 
 def _header(shape: tuple[int, ...], descr: str = "<f8", version: int = 1) -> bytes:

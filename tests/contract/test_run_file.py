@@ -176,7 +176,7 @@ def test_interrupted_write_keeps_the_old_file(tracked: Run, saved: Path, monkeyp
     assert [path.name for path in saved.parent.iterdir()] == ["run.npz"]
 
 
-# --- strangers' files ------------------------------------------------------------------------------
+# --- untrusted files ------------------------------------------------------------------------------
 
 Contents = dict[str, Any]
 
