@@ -1,7 +1,7 @@
 """The mechanism file, `mechanism.toml`, as a typed structure.
 
-What a key means stands in its structure's docstring, from which the reference is made: where numpydoc has the type,
-which the annotation says, stands the unit, and the last line is an example.
+The reference of the keys is generated from the docstrings of these structures. An attribute's docstring has the unit in
+the place of numpydoc's type, which the annotation gives, and ends with an example.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ Name = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class FrameSpec(FileStruct, frozen=True):
-    """A frame placed in a link (or ``joint:NAME``, or ``world``).
+    """A frame relative to a link, to ``joint:NAME`` or to ``world``.
 
     Attributes
     ----------
     link
-        A link, ``joint:NAME`` or ``world``.
+        The link, ``joint:NAME`` or ``world`` that it is fixed to.
         ``link = "rod"``
     xyz : m
-        Position in it.
+        Position relative to it.
         ``xyz = [0.6, 0.0, 0.0]``
     rpy : rad
-        Orientation in it: roll, pitch, yaw about fixed axes, as in a URDF.
+        Orientation relative to it: roll, pitch, yaw about fixed axes, as in a URDF.
         ``rpy = [0.0, 1.5707963, 0.0]``
     """
 
@@ -62,21 +62,21 @@ Frame = Name | FrameSpec
 
 
 class CouplingSpec(FileStruct, frozen=True):
-    """joint = ratio * other + offset.
+    """A gear between two joints: joint = ratio * other + offset.
 
     Attributes
     ----------
     joint
-        a in a = ratio b + offset.
+        The joint a in a = ratio * b + offset.
         ``joint = "wheel"``
     other
-        b.
+        The joint b.
         ``other = "pinion"``
-    ratio : a's by b's
+    ratio : unit of a per unit of b
         Gear ratio, with its sign.
         ``ratio = -0.5``
     offset : rad, m
-        Of a where b is 0.
+        Value of a where b is 0.
         ``offset = 0.1``
     """
 
@@ -92,25 +92,25 @@ class SpringSpec(FileStruct, frozen=True):
     Attributes
     ----------
     frame_a
-        One end, with ``frame_b``; or ``joint``.
+        Frame of one end; requires ``frame_b``.
         ``frame_a = "world"``
     frame_b
-        The other end.
+        Frame of the other end.
         ``frame_b = {link = "rod", xyz = [0.3, 0.0, 0.0]}``
     rest_length : m
-        Of the spring between two frames; absent: 0.
+        Length without force, of a spring between frames. Default: 0.
         ``rest_length = 0.25``
     joint
-        A joint of one freedom, in the place of two frames.
+        A joint of one freedom, for a spring on a joint instead of between frames.
         ``joint = "hip"``
     rest : rad, m
-        The joint's position without force; absent: 0.
+        Position of the joint without force. Default: 0.
         ``rest = 1.2``
     stiffness : N/m, N m/rad
-        Force by elongation.
+        Force per elongation.
         ``stiffness = 800.0``
     damping : N s/m, N m s/rad
-        Force by rate of elongation.
+        Force per rate of elongation.
         ``damping = 5.0``
     """
 
@@ -124,9 +124,9 @@ class SpringSpec(FileStruct, frozen=True):
 
 
 class ForceSpec(FileStruct, frozen=True):
-    """A constant force or torque on a joint, N or N m: part of the mechanism, with potential -value * coordinate.
+    """A constant force or torque on a joint, such as a constant drive torque or a weight on a string.
 
-    A motor's fixed drive torque, a weight on a string: what pushes a joint without being a controller.
+    It belongs to the mechanism, not to a controller, and has the potential energy -value * coordinate.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class ForceSpec(FileStruct, frozen=True):
         A joint of one freedom.
         ``joint = "slider"``
     value : N, N m
-        Along its coordinate; potential -value × coordinate.
+        Force along the coordinate; potential energy -value × coordinate.
         ``value = -9.81``
     """
 
@@ -143,7 +143,7 @@ class ForceSpec(FileStruct, frozen=True):
 
 
 class JointSpec(FileStruct, frozen=True):
-    """What one joint itself does; what is absent is the URDF's, N, N m, kg m^2 (kg) and N m s/rad (N s/m).
+    """Rotor inertia, damping, dry friction and stops of one joint.
 
     Attributes
     ----------
@@ -151,19 +151,19 @@ class JointSpec(FileStruct, frozen=True):
         A joint of one freedom.
         ``name = "hip"``
     armature : kg m², kg
-        Inertia of a rotor, reflected through its gear; on the diagonal of D'; absent: none.
+        Inertia of a rotor, reflected through its gear, added to the diagonal of D'. Default: 0.
         ``armature = 0.02``
     damping : N m s/rad, N s/m
-        Viscous friction; absent: the URDF's.
+        Viscous friction. Default: the value of the URDF.
         ``damping = 0.1``
     friction : N m, N
-        Dry friction: the most that holds it at rest, and what opposes its motion; absent: the URDF's.
+        Dry friction: the largest force at rest, and the force against the motion. Default: the value of the URDF.
         ``friction = 0.3``
     stops
-        The URDF's limits are walls.
+        Whether the limits of the URDF are stops.
         ``stops = true``
     restitution
-        Of an impact at a stop: speed after over speed before.
+        Coefficient of restitution of impacts at the stops: speed after over speed before.
         ``restitution = 0.5``
     """
 
@@ -176,32 +176,32 @@ class JointSpec(FileStruct, frozen=True):
 
 
 class MotorSpec(FileStruct, frozen=True):
-    """A motor on a joint, or on a sum of joints: its angle is ratio times the sum of what `joints` says.
+    """A motor on a joint, or on a weighted sum of joints.
 
-    torque_limit, speed_limit and tau are its own, before the gear: it acts on a joint as ratio * tau.
+    torque_limit, speed_limit and tau are at the shaft of the motor. It acts on a joint with the torque ratio * tau.
 
     Attributes
     ----------
     name
-        Its key wherever tau is given by name; absent: the joint's.
+        Name of the motor, where tau is given by name. Default: the name of the joint.
         ``name = "hip_motor"``
     joint
         A joint of one freedom.
         ``joint = "hip"``
     joints
-        What it turns with each of several joints, ``{a = 1.0, b = -1.0}``; needs a ``name``.
+        Weights of several joints, whose sum times ``ratio`` is the angle of the motor; requires a ``name``.
         ``joints = {left = 1.0, right = -1.0}``
-    ratio : its by the joint's
-        Gear, with its sign; not 0.
+    ratio : unit of the motor per unit of the joint
+        Gear ratio, with its sign; not 0.
         ``ratio = 50.0``
     rotor_inertia : kg m², kg
-        Of the rotor: ratio² times it is added to the joint's armature; for a motor on one joint.
+        Inertia of the rotor; ratio² times it is added to the armature of the joint. For a motor on one joint.
         ``rotor_inertia = 1.2e-5``
     torque_limit : N m, N
-        |tau| never exceeds it.
+        Largest |tau|.
         ``torque_limit = 0.6``
     speed_limit : rad/s, m/s
-        Of the motor; nothing holds it there, a run says where it is exceeded.
+        Largest speed of the motor. A run reports where it is exceeded, but does not enforce it.
         ``speed_limit = 300.0``
     """
 
@@ -218,7 +218,7 @@ LoopType = Literal["point", "point_2d", "hinge", "cylindrical", "universal", "pr
 
 
 class TreeSpec(FileStruct, frozen=True):
-    """One URDF of the world.
+    """One URDF tree of a mechanism.
 
     Attributes
     ----------
@@ -226,19 +226,19 @@ class TreeSpec(FileStruct, frozen=True):
         The URDF, beside this file or ``package://...``.
         ``file = "package://example-robot-data/robots/ur_description/urdf/ur5_robot.urdf"``
     prefix
-        Before every link, joint and frame name of this tree.
+        Prefix of all link, joint and frame names of this tree.
         ``prefix = "left_"``
     root
-        A free root has the six coordinates ``root.x`` to ``root.rz``.
+        Whether the root link is fixed or free; a free root has the six coordinates ``root.x`` to ``root.rz``.
         ``root = "free"``
     parent
-        The link of an earlier tree, or ``world``, that the root stands on.
+        The link of an earlier tree, or ``world``, that the root is placed on.
         ``parent = "table"``
     xyz : m
-        Position in the parent.
+        Position relative to the parent.
         ``xyz = [0.0, 0.5, 0.0]``
     rpy : rad
-        Orientation in the parent: roll, pitch, yaw about fixed axes, as in a URDF.
+        Orientation relative to the parent: roll, pitch, yaw about fixed axes, as in a URDF.
         ``rpy = [0.0, 0.0, 1.5707963]``
     """
 
@@ -256,28 +256,28 @@ class LoopSpec(FileStruct, frozen=True):
     Attributes
     ----------
     name
-        Names its rows: ``elbow.x``, ``elbow.y``.
+        Name of the loop, which prefixes its rows: ``elbow.x``, ``elbow.y``.
         ``name = "elbow"``
     type
-        Which rows it has.
+        Type of the loop, which determines its constraint rows.
         ``type = "point_2d"``
     frame_a
         Frame A: a link, ``joint:NAME``, ``world``, or a table ``{link, xyz, rpy}``.
         ``frame_a = {link = "rod", xyz = [0.6, 0.0, 0.0]}``
     frame_b
-        Frame B, in the same ways.
+        Frame B, specified in the same way.
         ``frame_b = "joint:knee"``
     rows_in
         The axes that p_A - p_B is resolved in: frame A's or the world's.
         ``rows_in = "world"``
     axis_a
-        The direction a, in frame A; its length does not matter.
+        The direction a in frame A; its length is ignored.
         ``axis_a = [0.0, 1.0, 0.0]``
     axis_b
-        The direction b, in frame B.
+        The direction b in frame B; its length is ignored.
         ``axis_b = [0.0, 1.0, 0.0]``
     length : m
-        Of ``distance``, which needs it; no other type takes it.
+        Distance between the origins of the frames, for type ``distance`` only.
         ``length = 0.3``
     """
 
@@ -292,15 +292,15 @@ class LoopSpec(FileStruct, frozen=True):
 
 
 class PointSpec(FileStruct, frozen=True):
-    """A point to report and to trace.
+    """A named point, which runs report and playback traces.
 
     Attributes
     ----------
     name
-        The key under ``points``.
+        Name of the point, its key in ``points``.
         ``name = "tip"``
     frame
-        A link, ``joint:NAME``, or a table ``{link, xyz, rpy}``; the point is its origin.
+        The frame whose origin is the point: a link, ``joint:NAME``, or a table ``{link, xyz, rpy}``.
         ``frame = {link = "rod", xyz = [0.6, 0.0, 0.0]}``
     """
 
@@ -309,39 +309,39 @@ class PointSpec(FileStruct, frozen=True):
 
 
 class MechanismSpec(FileStruct, frozen=True):
-    """The whole file.
+    """The contents of a mechanism file.
 
     Attributes
     ----------
     name
-        What it is called.
+        Name of the mechanism.
         ``name = "five_bar"``
     urdf
-        File of the one fixed tree, beside this file, or ``package://...``; either this or ``[[tree]]``.
+        The URDF of a single fixed tree, beside this file, or ``package://...``. Otherwise give ``[[tree]]``.
         ``urdf = "five_bar.urdf"``
     tree
-        The URDFs of a world of several, or of a free root.
+        URDF trees, for several trees or a free root.
         ``tree = [{file = "left.urdf", prefix = "left_"}]``
     gravity : m/s²
-        Acceleration, in the world's axes.
+        Acceleration of gravity in world axes.
         ``gravity = [0.0, -9.81, 0.0]``
     independent
-        q, in the order that u, D, C, h and matrix gains have; absent: chosen by a pivoted factorization,
-        coordinates with motors first as far as φ_z stays sound.
+        The independent coordinates q, in the order of u, D, C, h and matrix gains. Default: chosen by a pivoted
+        factorization, which prefers coordinates with motors as far as φ_z stays well conditioned.
         ``independent = ["theta_1", "theta_3"]``
     actuated
-        Joints with a motor of their name, without a gear, in tau's order; in the place of ``[[motor]]``;
-        absent both: the independent ones.
+        Joints with a motor of the same name and without a gear, in the order of tau, instead of ``[[motor]]``.
+        Default: the independent joints.
         ``actuated = ["theta_1", "theta_3"]``
     q_guess : rad, m
-        Where assembly starts; it picks the assembly branch; 0 for what is not named. Where it leads beyond stops:
-        the nearest within them.
+        Initial guess of the assembly, which selects the assembly branch. Default: 0 for each coordinate. If it leads
+        beyond stops, the mechanism is assembled at the nearest configuration within them.
         ``q_guess = {theta_1 = -1.4, "root.z" = 0.5}``
     loop
         Loop closures.
         ``loop = [{name = "elbow", type = "point_2d", frame_a = "left", frame_b = "right"}]``
     coupling
-        Gears: one coordinate follows another.
+        Gears between two joints.
         ``coupling = [{joint = "wheel", other = "pinion", ratio = -0.5}]``
     spring
         Springs and dampers.
@@ -350,13 +350,13 @@ class MechanismSpec(FileStruct, frozen=True):
         Constant forces and torques.
         ``force = [{joint = "slider", value = -9.81}]``
     joint
-        What joints themselves do: rotors, friction, stops.
+        Rotor inertia, friction and stops of joints.
         ``joint = [{name = "hip", friction = 0.2}]``
     motor
-        Motors with their gears, in tau's order.
+        Motors with their gears, in the order of tau.
         ``motor = [{joint = "hip", ratio = 50.0}]``
     point
-        Points that are reported at the end of a run and traced in playback.
+        Named points, which runs report and playback traces.
         ``point = [{name = "tip", frame = "foot"}]``
     """
 
@@ -376,6 +376,6 @@ class MechanismSpec(FileStruct, frozen=True):
     point: list[PointSpec] = []
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the file's content as plain data."""
-        plain: dict[str, Any] = msgspec.to_builtins(self)
-        return plain
+        """Return the contents of the file as JSON-ready data."""
+        data: dict[str, Any] = msgspec.to_builtins(self)
+        return data

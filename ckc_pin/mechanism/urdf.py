@@ -1,12 +1,15 @@
-"""Read URDF files, which are untrusted input, into one Pinocchio model.
+"""Read and check URDF files (untrusted input), and merge several trees into one URDF for Pinocchio.
 
-XML is parsed strictly by expat, document types (and with them entities) are refused, and what
-Pinocchio would accept in silence is checked here: negative or NaN masses, zero axes, duplicate names,
-unknown parents, two roots, two inertials of a link. `continuous` joints are loaded as revolute ones without limits,
-so that every joint is one number (Pinocchio would use a cosine and a sine); a `planar` joint is refused since
-Pinocchio ignores its axis. An inertial without one of its numbers is refused too: urdfdom, which reads for
-Pinocchio, drops it with a line on stderr and the link has no mass. Several trees become one URDF under a
-common root, stripped to what dynamics need, before Pinocchio sees them.
+XML is parsed strictly (`parse_xml`). Errors that Pinocchio accepts silently are rejected here: negative or NaN masses,
+zero axes, duplicate names, unknown parents, two roots, two inertials of a link. Three cases need more care:
+
+- A `continuous` joint becomes a revolute joint without limits, so that its coordinate is one number. Pinocchio would
+  use a cosine and a sine.
+- A `planar` joint is rejected, since Pinocchio ignores its axis.
+- An inertial without mass or inertia is rejected. urdfdom, which reads URDFs for Pinocchio, would drop it with a line
+  on stderr, and the link would have no mass.
+
+Several trees are merged under a common root, with only the elements that dynamics needs.
 """
 
 from __future__ import annotations
@@ -40,13 +43,13 @@ __all__ = [
     "parse",
 ]
 
-WORLD = "ckc_pin_world"  # the common root of several trees
+WORLD = "ckc_pin_world"  # common root link of several trees
 DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
 
 
 @dataclass(frozen=True)
 class TreeText:
-    """A URDF's text and how it stands in the world."""
+    """Text of a URDF, and the pose and parent of its tree."""
 
     text: str
     source: str
@@ -64,9 +67,9 @@ class UrdfTree:
     Attributes
     ----------
     root : Element
-        The <robot>, names prefixed, continuous joints turned into revolute ones.
+        The <robot> element, with prefixed names and continuous joints converted to revolute ones.
     base : str
-        Its root link.
+        Name of the root link.
     mimic : list of (joint, other, ratio, offset)
     warnings : list of str
     """
@@ -83,13 +86,13 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     Raises
     ------
     InputError
-        Malformed XML, or a number that is none.
+        Malformed XML, or an invalid number.
     MechanismError
-        A tree that is none, or a body that cannot be.
+        The joints do not form a tree, or a body or joint is physically impossible.
     """
     root = parse_xml(text, source)
     if root.tag != "robot":
-        raise InputError(f"{source}: the root element is <{root.tag}>, a URDF's is <robot>")
+        raise InputError(f"{source}: expected the root element <robot> of a URDF, got <{root.tag}>")
     if prefix:
         _add_prefix(root, prefix)
     links = by_name(root, "link", source)
@@ -108,42 +111,44 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
         children[child] = name
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
-        found = ", ".join(map(repr, roots)) or "none: the joints form a circle"
-        raise MechanismError(f"{source}: a URDF is a tree with one root link; roots found: {found}")
+        listed = ", ".join(map(repr, roots)) or "none: the joints form a circle"
+        raise MechanismError(f"{source}: a URDF is a tree with one root link; roots found: {listed}")
     check_connected(roots[0], joints, links, source)
     tree.base = roots[0]
     return tree
 
 
 def merge(trees: Sequence[TreeText]) -> tuple[str, UrdfTree]:
-    """Parse several trees and put them into one world.
+    """Parse several trees and merge them into one URDF.
 
     Returns
     -------
     text : str
-        One URDF, ready for Pinocchio.
+        The merged URDF, for Pinocchio.
     tree : UrdfTree
-        Its checks' findings, over all trees.
+        The merged tree, with the couplings and warnings of all trees.
     """
     parsed = [parse(t.text, t.source, t.prefix) for t in trees]
     if len(trees) == 1 and _stands_at_origin(trees[0]):
-        whole = UrdfTree(ElementTree.Element("robot", name="world"), parsed[0].base)
-        _append(whole, trees[0], parsed[0], set(), set())
+        merged = UrdfTree(ElementTree.Element("robot", name="world"), parsed[0].base)
+        _append(merged, trees[0], parsed[0], set(), set())
     else:
-        whole = _common_world(trees, parsed)
-    return ElementTree.tostring(whole.root, encoding="unicode"), whole
+        merged = _common_world(trees, parsed)
+    return ElementTree.tostring(merged.root, encoding="unicode"), merged
 
 
 def _common_world(trees: Sequence[TreeText], parsed: Sequence[UrdfTree]) -> UrdfTree:
     robot = ElementTree.Element("robot", name="world")
     ElementTree.SubElement(robot, "link", name=WORLD)
-    whole = UrdfTree(robot, WORLD)
+    merged = UrdfTree(robot, WORLD)
     links, joints = {WORLD}, set[str]()
     for text, tree in zip(trees, parsed, strict=True):
         parent = WORLD if text.parent == "world" else text.parent
         if parent not in links:
-            known = ", ".join(sorted(links - {WORLD})) or "only the world so far"
-            raise MechanismError(f"{text.source}: its parent {text.parent!r} is no link of an earlier tree: {known}")
+            choices = ", ".join(sorted(links - {WORLD})) or "only the world so far"
+            raise MechanismError(
+                f"{text.source}: its parent {text.parent!r} is not a link of an earlier tree: {choices}"
+            )
         free = text.root == "free"
         name = f"{text.prefix}root" if free else f"{text.prefix}{tree.base}_to_{text.parent}"
         joint = ElementTree.SubElement(robot, "joint", name=name, type="floating" if free else "fixed")
@@ -151,25 +156,25 @@ def _common_world(trees: Sequence[TreeText], parsed: Sequence[UrdfTree]) -> Urdf
         ElementTree.SubElement(joint, "child", link=tree.base)
         ElementTree.SubElement(joint, "origin", xyz=_numbers(text.xyz), rpy=_numbers(text.rpy))
         joints.add(name)
-        _append(whole, text, tree, links, joints)
-    return whole
+        _append(merged, text, tree, links, joints)
+    return merged
 
 
-def _append(whole: UrdfTree, text: TreeText, tree: UrdfTree, links: set[str], joints: set[str]) -> None:
-    """Append what dynamics need of a tree: no pictures, no controllers' data, nothing that is given twice."""
+def _append(merged: UrdfTree, text: TreeText, tree: UrdfTree, links: set[str], joints: set[str]) -> None:
+    """Append the elements of a tree that dynamics needs, without visuals and controller data."""
     for element in tree.root:
         if element.tag not in DYNAMIC:
             continue
-        name, seen = element.attrib["name"], links if element.tag == "link" else joints
-        if name in seen:
+        name, names = element.attrib["name"], links if element.tag == "link" else joints
+        if name in names:
             raise MechanismError(
                 f"{text.source}: {element.tag} {name!r} is already in an earlier tree; give this [[tree]] a prefix"
             )
-        seen.add(name)
-        bare = ElementTree.SubElement(whole.root, element.tag, element.attrib)
+        names.add(name)
+        bare = ElementTree.SubElement(merged.root, element.tag, element.attrib)
         bare.extend(part for tag in DYNAMIC[element.tag] if (part := element.find(tag)) is not None)
-    whole.mimic += tree.mimic
-    whole.warnings += tree.warnings
+    merged.mimic += tree.mimic
+    merged.warnings += tree.warnings
 
 
 def _stands_at_origin(tree: TreeText) -> bool:
@@ -193,38 +198,40 @@ def _add_prefix(root: ElementTree.Element, prefix: str) -> None:
 
 Mimic = tuple[str, str, float, float]  # joint, other, ratio, offset
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)  # what both Python and C read alike
+NUMBER = re.compile(
+    r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII
+)  # the numbers that Python and C read in the same way
 INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 LIMITS = ("lower", "upper")
-SHORTEST = 1e-9  # an axis that is not zero by mistake
-ROUNDING = 1e-18  # kg m^2: what is left of a zero tensor that was turned about
+MIN_AXIS_LENGTH = 1e-9  # a shorter axis is taken for zero
+INERTIA_TOLERANCE = 1e-18  # kg m^2: rounding error of a zero inertia that was rotated
 SINGLE_ELEMENTS = {
     "link": ("inertial",),
     "inertial": ("origin", "mass", "inertia"),
     "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
-}  # what the URDF format allows once in an element and dynamics need; a reader takes the first of several
+}  # child elements that the URDF format allows once; a reader would take the first of several
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 
 
 def by_name(root: ElementTree.Element, tag: str, source: str) -> dict[str, ElementTree.Element]:
-    """Return the elements of one tag by name; two of one name are refused."""
-    found: dict[str, ElementTree.Element] = {}
+    """Return the elements of one tag by name. Two elements of one name are an error."""
+    elements: dict[str, ElementTree.Element] = {}
     for element in root.findall(tag):
         name = element.get("name")
         if not name:
             raise MechanismError(f"{source}: a <{tag}> has no name")
-        if name in found:
+        if name in elements:
             raise MechanismError(f"{source}: two <{tag}> elements are called {name!r}")
-        found[name] = element
-    if tag == "link" and not found:
+        elements[name] = element
+    if tag == "link" and not elements:
         raise MechanismError(f"{source}: no <link>")
-    return found
+    return elements
 
 
 def floats(
     element: ElementTree.Element | None, attribute: str, count: int, default: str | None, where: str
 ) -> list[float]:
-    """Read an attribute's numbers; without a default it must be there."""
+    """Read the numbers of an attribute. It is required if `default` is None."""
     text = default if element is None else element.get(attribute, default)
     if text is None:
         raise InputError(f"{where} has no {attribute}")
@@ -239,26 +246,26 @@ def _finite_numbers(count: int) -> str:
     return "a finite number" if count == 1 else f"{count} finite numbers"
 
 
-def _origin(element: ElementTree.Element, where: str) -> None:
+def _check_origin(element: ElementTree.Element, where: str) -> None:
     origin = element.find("origin")
     floats(origin, "xyz", 3, "0 0 0", f"{where}, <origin>")
     floats(origin, "rpy", 3, "0 0 0", f"{where}, <origin>")
 
 
-def _needed(element: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
-    found = element.find(tag)
-    if found is None:
+def _require_child(element: ElementTree.Element, tag: str, where: str) -> ElementTree.Element:
+    child = element.find(tag)
+    if child is None:
         raise InputError(f"{where} has no <{tag}>")
-    return found
+    return child
 
 
 def check_single_elements(element: ElementTree.Element, where: str) -> None:
-    """Refuse elements that the URDF format allows once in a link or joint and that are there several times.
+    """Reject elements that occur several times in a link or joint although the URDF format allows them once.
 
     Raises
     ------
     MechanismError
-        Names the element.
+        An element occurs several times.
     """
     for tag in SINGLE_ELEMENTS[element.tag]:
         count = len(element.findall(tag))
@@ -270,20 +277,20 @@ def check_single_elements(element: ElementTree.Element, where: str) -> None:
 
 
 def check_inertial(name: str, link: ElementTree.Element, source: str, warnings: list[str]) -> None:
-    """Refuse a body that cannot be; note one that no body can have but a planar model may."""
+    """Reject a physically impossible mass or inertia. Warn of an inertia that only a planar model can have."""
     inertial = link.find("inertial")
     if inertial is None:
         return
     where = f"{source}: link {name!r}"
-    _origin(inertial, where)
-    (mass,) = floats(_needed(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
+    _check_origin(inertial, where)
+    (mass,) = floats(_require_child(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
     if mass < 0:
         raise MechanismError(f"{where}: negative mass {mass:g} kg")
-    tensor = _needed(inertial, "inertia", f"{where}, <inertial>")
+    tensor = _require_child(inertial, "inertia", f"{where}, <inertial>")
     xx, yy, zz, xy, xz, yz = (floats(tensor, key, 1, None, f"{where}, <inertia>")[0] for key in INERTIA)
     principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     size = float(np.abs(principal).max())
-    if principal[0] < -(1e-9 * size + ROUNDING):
+    if principal[0] < -(1e-9 * size + INERTIA_TOLERANCE):
         raise MechanismError(f"{where}: its inertia has a negative principal moment, {principal[0]:g} kg m^2")
     if principal[2] > (principal[0] + principal[1]) * (1 + 1e-6) + 1e-12 * size:
         warnings.append(
@@ -295,22 +302,22 @@ def check_inertial(name: str, link: ElementTree.Element, source: str, warnings: 
 def check_joint(
     name: str, joint: ElementTree.Element, links: dict[str, ElementTree.Element], source: str, mimics: list[Mimic]
 ) -> str:
-    """Check a joint, make it one that Pinocchio reads as meant, note its coupling; return its child."""
+    """Check a joint, rewrite it so that Pinocchio reads it correctly, and collect its mimic. Return its child link."""
     where = f"{source}: joint {name!r}"
     kind = joint.get("type")
     if kind not in JOINT_TYPES:
-        found = f"type {kind!r} is not supported" if kind else "it has no type"
-        raise MechanismError(f"{where}: {found}; valid: {', '.join(JOINT_TYPES)}")
+        problem = f"type {kind!r} is not supported" if kind else "it has no type"
+        raise MechanismError(f"{where}: {problem}; valid: {', '.join(JOINT_TYPES)}")
     for tag in ("parent", "child"):
-        link = _needed(joint, tag, where).get("link")
+        link = _require_child(joint, tag, where).get("link")
         if link not in links:
-            found = f"its {tag} link {link!r} does not exist" if link else f"its <{tag}> names no link"
-            raise MechanismError(f"{where}: {found}; there are {', '.join(links)}")
-    _origin(joint, where)
+            problem = f"its {tag} link {link!r} does not exist" if link else f"its <{tag}> names no link"
+            raise MechanismError(f"{where}: {problem}; there are {', '.join(links)}")
+    _check_origin(joint, where)
     if kind in ("revolute", "continuous", "prismatic"):
         element = joint.find("axis")
         axis = floats(element, "xyz", 3, "1 0 0" if element is None else None, f"{where}, <axis>")
-        if math.hypot(*axis) < SHORTEST:
+        if math.hypot(*axis) < MIN_AXIS_LENGTH:
             raise MechanismError(f"{where}: its axis is zero")
         _limits(joint, kind, where)
         _damping(joint, where)
@@ -319,7 +326,7 @@ def check_joint(
 
 
 def _mimic(name: str, joint: ElementTree.Element, where: str, mimics: list[Mimic]) -> None:
-    """Take note of a coupling, which is a closure to us."""
+    """Collect a mimic joint, which becomes a constraint row."""
     mimic = joint.find("mimic")
     if mimic is None:
         return
@@ -332,7 +339,7 @@ def _mimic(name: str, joint: ElementTree.Element, where: str, mimics: list[Mimic
 
 
 def _damping(joint: ElementTree.Element, where: str) -> None:
-    """Damping and friction take energy away, they never give any; both absent is an error to urdfdom."""
+    """Require damping and friction of at least zero, and write both, since urdfdom requires both."""
     dynamics = joint.find("dynamics")
     if dynamics is None:
         return
@@ -344,7 +351,7 @@ def _damping(joint: ElementTree.Element, where: str) -> None:
 
 
 def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
-    """Leave Pinocchio a joint it cannot misread: an absent range is no range, not [0, 0]."""
+    """Write the limits for Pinocchio. Without limits the range is infinite, where urdfdom would read [0, 0]."""
     limit = joint.find("limit")
     unbounded = kind == "continuous" or limit is None or ("lower" not in limit.attrib and "upper" not in limit.attrib)
     if kind == "continuous":
@@ -362,7 +369,7 @@ def _limits(joint: ElementTree.Element, kind: str, where: str) -> None:
 
 
 def check_range(joint: ElementTree.Element, where: str) -> None:
-    """Refuse limits that leave nothing between them."""
+    """Require that the lower limit is not above the upper limit."""
     lower, upper = (floats(joint.find("limit"), key, 1, "0", f"{where}, <limit>")[0] for key in LIMITS)
     if lower > upper:
         raise MechanismError(f"{where}: its lower limit {lower:g} is above the upper one {upper:g}")
@@ -371,7 +378,7 @@ def check_range(joint: ElementTree.Element, where: str) -> None:
 def check_connected(
     base: str, joints: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element], source: str
 ) -> None:
-    """Refuse links that hang together in a circle beside the tree."""
+    """Require that all links are connected to the root link."""
     below: dict[str, list[str]] = {}
     for joint in joints.values():
         below.setdefault(joint.find("parent").attrib["link"], []).append(joint.find("child").attrib["link"])  # type: ignore[union-attr]
@@ -383,6 +390,6 @@ def check_connected(
             yield link
             stack += below.get(link, [])
 
-    lost = set(links) - set(walk(base))
-    if lost:
-        raise MechanismError(f"{source}: links in a circle, not below {base!r}: {', '.join(sorted(lost))}")
+    unreachable = set(links) - set(walk(base))
+    if unreachable:
+        raise MechanismError(f"{source}: links in a circle, not below {base!r}: {', '.join(sorted(unreachable))}")

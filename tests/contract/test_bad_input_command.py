@@ -77,7 +77,7 @@ CASES = [
     Bad(
         "state with some dependent coordinates",
         [*TERMS, '{"theta_1": 1, "theta_2": 1, "theta_3": 1}'],
-        ["the independent coordinates alone (theta_1, theta_3) or all of them", "'theta_2'"],
+        ["expected the independent coordinates (theta_1, theta_3) or all coordinates", "'theta_2'"],
     ),
     Bad("state out of reach", [*TERMS, '{"theta_1": 3.1, "theta_3": 0}'], ["theta_1 = 3.1, theta_3 = 0", "reach"]),
     Bad("rates that are not JSON", [*TERMS, "{}", "--v", "fast"], ["--v fast: not JSON"]),

@@ -56,7 +56,7 @@ XML = [
     _whole("an unknown entity", '<robot name="&x;"/>', "malformed XML: undefined entity"),
     _whole("nested without end", "<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>", "nested more than"),
     _whole("two documents", "<robot/><robot/>", "malformed XML: junk after document element"),
-    _whole("another root", "<mujoco/>", "the root element is <mujoco>, a URDF's is <robot>"),
+    _whole("another root", "<mujoco/>", "expected the root element <robot> of a URDF, got <mujoco>"),
 ]
 
 TREE = [
