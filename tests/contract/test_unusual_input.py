@@ -198,7 +198,7 @@ def _with_meta(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
         content = {name: data[name] for name in data.files}
     meta = json.loads(content["meta"].tobytes())
     change(meta)
-    hashes = hashes_of(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # an attacker can compute the hashes, too
+    hashes = hashes_of(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # as an attacker can do
     content["meta"] = np.frombuffer(json.dumps(meta | {"hashes": hashes}).encode(), dtype=np.uint8)
     np.savez(path, **content)
 
