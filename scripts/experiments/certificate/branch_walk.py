@@ -1,4 +1,4 @@
-"""Small moves on one assembly branch: along sigma, measured by how far from singular they are."""
+"""Move along one assembly branch, measure its distance from singularity, and minimize values on it."""
 
 from __future__ import annotations
 
@@ -12,16 +12,27 @@ from ckc_pin.kinematics.sigma import follow_sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Border", "Height", "follow", "least", "margin", "margin_gradient", "same_configuration", "way"]
+__all__ = [
+    "Border",
+    "Height",
+    "find_minimum",
+    "follow",
+    "margin",
+    "margin_gradient",
+    "same_configuration",
+    "wrapped_difference",
+]
 
-GAIN = 1e-5  # of the value: what a move of the search for a least value has to gain
-FINEST = 1e-2  # of its first step: where that search ends
+MIN_GAIN = 1e-5  # relative; a step of the search for a minimum has to lower the value by this much
+MIN_STEP_FRACTION = 1e-2  # of the first step; the search ends there
+MARGIN_TOLERANCE = 1e-9  # relative; of a configuration on the border
+MAX_CORRECTIONS = 8  # to reach the border
 
 Height = Callable[[Kinematics], float]
 
 
 def margin(at: Kinematics) -> float:
-    """|s|: the volume spanned by the columns of phi_z over the product of their lengths, 1 at best, 0 where singular.
+    """Return |s|, the volume spanned by the columns of phi_z over the product of their lengths: 0 (singular) to 1.
 
     With square phi_z it is |det phi_z| over the columns' lengths; for the five-bar |det phi_z| / (l2 l4), the
     sine of the angle between the distal links.
@@ -33,7 +44,7 @@ def margin(at: Kinematics) -> float:
 
 
 def margin_gradient(at: Kinematics) -> Array:
-    """d |s| / d q along the branch, shape (d,): the logarithm of a volume changes by the trace of phi_z^+ dphi_z."""
+    """Return d|s|/dq along the branch, shape (d,), from d(log volume) = tr(phi_z^+ dphi_z)."""
     z = at.partition.z
     size = np.sum(at.phi_z**2, axis=0)
     slopes = []
@@ -44,18 +55,18 @@ def margin_gradient(at: Kinematics) -> Array:
 
 
 def follow(mechanism: Mechanism, at: Kinematics, dq: Array) -> tuple[Kinematics, float]:
-    """Move q by dq along the branch; return where that led and how much of the way it was, 1 for all of it."""
+    """Move q by dq along the branch; return the configuration reached and the fraction of dq covered."""
     moved = follow_sigma(at, dq, 0.0, mechanism.tolerance, anywhere=False)
     return moved.at, moved.reached
 
 
-def way(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Array:
-    """Return the shortest way in q from one configuration to another, whole turns left out, shape (d,)."""
+def wrapped_difference(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Array:
+    """Return the difference in q of two configurations, with angles wrapped into [-pi, pi), shape (d,)."""
     return _without_turns(mechanism, a, b)[mechanism.partition.q]
 
 
 def same_configuration(mechanism: Mechanism, a: Kinematics, b: Kinematics, tolerance: float = 1e-6) -> bool:
-    """Whether two configurations differ by whole turns at most."""
+    """Whether two configurations differ by full turns only."""
     return bool(np.abs(_without_turns(mechanism, a, b)).max(initial=0.0) < tolerance)
 
 
@@ -68,14 +79,14 @@ def _without_turns(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Array:
 
 @dataclass(frozen=True)
 class Border:
-    """Admits configurations on one side of |s| = s_min, and puts those on the other side on it, across it.
+    """Border |s| = s_min: accepts configurations on one side, and moves those on the other side onto it.
 
     Attributes
     ----------
     mechanism : Mechanism
     s_min : float
     near : bool
-        Whether the side next to the singular configuration is the admitted one.
+        Whether the side of the singular configuration is accepted.
     """
 
     mechanism: Mechanism
@@ -83,11 +94,11 @@ class Border:
     near: bool = False
 
     def __call__(self, at: Kinematics) -> Kinematics | None:
-        """Return an admitted configuration, or None when there is no way to one."""
+        """Return the configuration, or one on the border, or None if the border cannot be reached."""
         sign = -1.0 if self.near else 1.0
-        for _ in range(8):
+        for _ in range(MAX_CORRECTIONS):
             gap = self.s_min - margin(at)
-            if sign * gap <= 1e-9 * self.s_min:
+            if sign * gap <= MARGIN_TOLERANCE * self.s_min:
                 return at
             slope = margin_gradient(at)
             at, reached = follow(self.mechanism, at, (gap + sign * 1e-10 * self.s_min) * slope / (slope @ slope))
@@ -96,33 +107,33 @@ class Border:
         return None
 
 
-def least(
+def find_minimum(
     mechanism: Mechanism,
     start: Kinematics,
     value: Height,
     step: Array,
     admit: Callable[[Kinematics], Kinematics | None],
 ) -> Kinematics:
-    """Walk downhill along the coordinates, with ever shorter steps; return the lowest configuration found.
+    """Minimize a value by coordinate descent with shrinking steps; return the configuration of the minimum.
 
     Parameters
     ----------
     mechanism : Mechanism
     start : Kinematics
     value : callable
-        Of a configuration: what is to become low.
+        Of a configuration, to be minimized.
     step : (d,) array
         Longest step, rad or m.
     admit : callable
-        Returns a configuration as it is, or moved to where it is allowed, or None.
+        Returns an allowed configuration for a trial, or None.
     """
     at, low, scale = start, value(start), 0.5
-    while scale > FINEST:
+    while scale > MIN_STEP_FRACTION:
         for k in range(2 * mechanism.d):
             dq = np.zeros(mechanism.d)
             dq[k // 2] = scale * step[k // 2] * (1 if k % 2 else -1)
             there = admit(follow(mechanism, at, dq)[0])
-            if there is not None and (reached := value(there)) < low - GAIN * abs(low):
+            if there is not None and (reached := value(there)) < low - MIN_GAIN * abs(low):
                 at, low = there, reached
                 break
         else:

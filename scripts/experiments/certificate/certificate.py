@@ -1,14 +1,14 @@
-"""What can be said about a set-point controller (eq. 14) before it runs: the gain condition on a sublevel set.
+"""Certify a set-point controller (eq. 14) for a start: the gain condition on a sublevel set of V_L.
 
 With u of eq. 14, V_L = q_dot^T D q_dot / 2 + U(q) never grows along the reduced model, where
 
     U(q) = V(q) - V(q_d) - h(q_d)^T (q - q_d) + (q - q_d)^T K_P (q - q_d) / 2
 
-is V_L at rest. So q stays on the part of {U <= V_L(start)} that is connected to the start. Let that part be
-bounded and free of singular configurations, and U's second derivative K_P + dh/dq positive definite all over
-it. Then each solution of eq. 15 there, which is where U's gradient is zero, is a strict minimum of U; and a
-connected sublevel set with strict minima alone has one of them only, q_d (between two there would be a pass).
-No convexity of the set is needed, and no M_1 over the whole workspace, which does not exist.
+is V_L at rest. So q stays on the part of {U <= V_L(start)} that is connected to the start. Let that part be bounded
+and free of singular configurations, and let U's second derivative K_P + dh/dq be positive definite on it. Then each
+solution of eq. 15 there, where U's gradient is zero, is a strict minimum of U. A connected sublevel set whose critical
+points are all strict minima has only one of them, q_d, because between two minima there would be a saddle. The set need
+not be convex, and no M_1 over the whole workspace is needed, which does not exist.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start
-from scripts.experiments.certificate.branch_walk import Border, follow, least, margin, same_configuration
+from scripts.experiments.certificate.branch_walk import Border, find_minimum, follow, margin, same_configuration
 from scripts.experiments.certificate.exploration import Explored, explore
 from scripts.experiments.certificate.gradient_bounds import symmetric_least
 
 __all__ = ["Certificate", "SublevelSet", "certify", "level_of", "rest_height", "sublevel_set"]
 
 DIVISIONS = 50  # of the radius that the set would have without gravity
-SINGULAR = 1e-3  # |s| that counts as singular: the search for the least |s| ends that near to one
-NEAR = 0.03  # |s| at which U hardly differs from that of the singular configuration next to it
+SINGULAR_MARGIN = 1e-3  # |s| below which a configuration counts as singular
+BORDER_MARGIN = 0.03  # |s| at which U hardly differs from its value at the singular configuration
 
 Status = Literal["certified", "not certified"]
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Whether eq. 14 is proved to bring a start to q_d, on the resolution of a lattice.
+    """Whether eq. 14 provably brings a start to q_d, at the resolution of a lattice.
 
     Attributes
     ----------
     status : "certified" or "not certified"
-        "not certified" does not mean that the controller fails: only that this argument does not show it.
+        "not certified" does not mean that the controller fails, only that this argument does not prove it.
     reason : str
-        Why, in a sentence.
+        One sentence.
     level : float
         V_L at the start, J.
     least_eigenvalue : float
@@ -57,11 +57,11 @@ class Certificate:
     least_margin : float
         Least |s| on the set, see `scripts.experiments.certificate.branch_walk.margin`.
     safe_level : float
-        The level up to which the set around q_d is as the argument needs it, J, by the lattice; at most `level`.
+        Largest level, J, at which the set around q_d satisfies the conditions, by the lattice; at most `level`.
     worst_q : (d,) array
-        Where the argument fails first as the level rises; where the eigenvalue is least when it does not.
+        Where the conditions fail first as the level rises; if they never do, where the eigenvalue is smallest.
     sampled : bool
-        Along random rays instead of over a lattice: d > 2.
+        Whether random rays were followed instead of a lattice: d > 2.
     points : int
     resolution : (d,) array
         The lattice's step, rad or m.
@@ -81,7 +81,7 @@ class Certificate:
 
 @dataclass(frozen=True)
 class SublevelSet:
-    """The part of {U <= level} that is connected to q_d, and what was found on it.
+    """The part of {U <= level} that is connected to q_d, with the values on it.
 
     Attributes
     ----------
@@ -137,13 +137,13 @@ def sublevel_set(
 
 
 def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions: int = DIVISIONS) -> Certificate:
-    """Decide whether the argument of section II-B holds for a start.
+    """Decide whether the argument of section II-B applies to a start.
 
     Parameters
     ----------
     mechanism : Mechanism
     controller : SetPoint
-        Built for this very mechanism, and used without a torque limit.
+        Built for this mechanism, without a torque limit.
     start : Start
         On phi = 0.
     divisions : int
@@ -154,15 +154,15 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
     if unfit:
         nowhere = np.full(mechanism.d, np.nan)
         return Certificate("not certified", unfit, level, np.nan, np.nan, 0.0, nowhere, mechanism.d > 2, 0, nowhere)
-    found = sublevel_set(mechanism, controller, level, divisions)
-    search = _Search(mechanism, controller, found, level)
+    sublevel = sublevel_set(mechanism, controller, level, divisions)
+    search = _Search(mechanism, controller, sublevel, level)
     tight, soft = search.tightest(), search.softest()
-    singular = bool(found.explored.ends) or margin(tight) <= SINGULAR
+    singular = bool(sublevel.explored.ends) or margin(tight) <= SINGULAR_MARGIN
     failure = search.first_failure([tight, soft])
     safe_level, worst = failure or (level, soft)
     return Certificate(
         status="certified"
-        if failure is None and not found.explored.full and search.connected(start)
+        if failure is None and not sublevel.explored.full and search.connected(start)
         else "not certified",
         reason=search.reason(singular, tight, soft, start),
         level=level,
@@ -170,14 +170,14 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
         least_margin=0.0 if singular else margin(tight),
         safe_level=safe_level,
         worst_q=mechanism.independent_part(worst.q_tree),
-        sampled=found.explored.sampled,
-        points=len(found.explored.nodes),
-        resolution=found.step,
+        sampled=sublevel.explored.sampled,
+        points=len(sublevel.explored.nodes),
+        resolution=sublevel.step,
     )
 
 
 def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: float) -> str:
-    """Say why the argument does not even begin."""
+    """Return why the argument does not apply at all; empty if it may apply."""
     if controller.target.mechanism is not mechanism:
         return "the controller compensates the gravity of another model than the plant"
     if not mechanism.tree.is_euclidean:
@@ -185,17 +185,17 @@ def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: floa
     if np.any(start.w):
         return "the start is off phi = 0: V_L is a Lyapunov function of the reduced model only"
     if level < -1e-12 * (1.0 + abs(controller.target.potential_energy)):
-        return "V_L is lower at the start than at q_d, where it would have to be least"
+        return "V_L is lower at the start than at q_d, where it must be smallest"
     return ""
 
 
 @dataclass(frozen=True)
 class _Search:
-    """What the lattice has found, searched on between its points."""
+    """Search between the points of the lattice."""
 
     mechanism: Mechanism
     controller: SetPoint
-    found: SublevelSet
+    sublevel: SublevelSet
     level: float
 
     def height(self, at: Kinematics) -> float:
@@ -205,23 +205,25 @@ class _Search:
         return _stiffness(self.mechanism, self.controller, at)
 
     def fails(self, at: Kinematics) -> bool:
-        return margin(at) <= SINGULAR or self.stiffness(at) <= 0
+        return margin(at) <= SINGULAR_MARGIN or self.stiffness(at) <= 0
 
     def tightest(self) -> Kinematics:
-        if self.found.explored.ends:
-            return min(self.found.explored.ends, key=lambda end: end.water).at
-        return self._lowest(margin, self.found.margins)
+        if self.sublevel.explored.ends:
+            return min(self.sublevel.explored.ends, key=lambda end: end.water).at
+        return self._lowest(margin, self.sublevel.margins)
 
     def softest(self) -> Kinematics:
-        if self.found.explored.ends:
-            return self.found.explored.nodes[int(np.argmin(self.found.eigenvalues))]
-        return self._lowest(self.stiffness, self.found.eigenvalues)
+        if self.sublevel.explored.ends:
+            return self.sublevel.explored.nodes[int(np.argmin(self.sublevel.eigenvalues))]
+        return self._lowest(self.stiffness, self.sublevel.eigenvalues)
 
     def first_failure(self, refined: list[Kinematics]) -> tuple[float, Kinematics] | None:
-        """Return up to which level of U nothing fails, and where something does first; None if nowhere."""
-        explored = self.found.explored
+        """Return the largest level without a failure and the first failure; None if nothing fails."""
+        explored = self.sublevel.explored
         failing = [
-            (w, at) for w, at, x in zip(explored.water, explored.nodes, self.found.eigenvalues, strict=True) if x <= 0
+            (w, at)
+            for w, at, x in zip(explored.water, explored.nodes, self.sublevel.eigenvalues, strict=True)
+            if x <= 0
         ]
         failing += [(max(0.0, self.height(at)), at) for at in refined if self.fails(at)]
         failing += [(end.water, end.at) for end in explored.ends]
@@ -229,8 +231,8 @@ class _Search:
             return None
         water, first = min(failing, key=lambda pair: pair[0])
         below = max((w for w in explored.water if w < water), default=0.0)
-        near = Border(self.mechanism, NEAR, near=True) if margin(first) <= SINGULAR else self._failing
-        lowest = least(self.mechanism, first, self.height, self.found.step, near)
+        near = Border(self.mechanism, BORDER_MARGIN, near=True) if margin(first) <= SINGULAR_MARGIN else self._failing
+        lowest = find_minimum(self.mechanism, first, self.height, self.sublevel.step, near)
         return min(below, max(0.0, self.height(lowest))), lowest if 0.0 <= self.height(lowest) < water else first
 
     def reason(self, singular: bool, tight: Kinematics, soft: Kinematics, start: Start) -> str:
@@ -238,28 +240,28 @@ class _Search:
             return f"the set reaches a singular configuration, near {self._where(tight)}"
         if self.stiffness(soft) <= 0:
             return f"K_P + dh/dq has the eigenvalue {self.stiffness(soft):.3g} at {self._where(soft)}, inside the set"
-        if self.found.explored.full:
-            return f"the set goes on beyond the {len(self.found.explored.nodes)} points that were looked at"
+        if self.sublevel.explored.full:
+            return f"the set extends beyond the {len(self.sublevel.explored.nodes)} points that were explored"
         if not self.connected(start):
             return "the start is not connected to q_d within {V_L(q, 0) <= V_L(start)}"
         return "K_P + dh/dq is positive definite on the whole set, and no singular configuration lies on it"
 
     def connected(self, start: Start) -> bool:
-        """Whether the start is next to a node of the lattice, or seen from q_d, on the same branch."""
-        if self.found.explored.sampled:
-            return self._seen(start.at)
+        """Whether the start is next to a node of the lattice, or visible from q_d, on the same branch."""
+        if self.sublevel.explored.sampled:
+            return self._is_visible(start.at)
         q = self.mechanism.independent_part(start.at.q_tree)
-        for at in self.found.explored.nodes:
+        for at in self.sublevel.explored.nodes:
             straight = q - self.mechanism.independent_part(at.q_tree)
-            if np.all(np.abs(straight) <= 1.01 * self.found.step) and self._leads(at, straight, start.at):
+            if np.all(np.abs(straight) <= 1.01 * self.sublevel.step) and self._leads(at, straight, start.at):
                 return True
         return False
 
-    def _seen(self, there: Kinematics) -> bool:
-        """Whether the straight line from q_d stays inside."""
+    def _is_visible(self, there: Kinematics) -> bool:
+        """Whether the straight line from q_d stays inside the set."""
         at = self.controller.target.at
         straight = self.mechanism.independent_part(there.q_tree) - self.controller.q_d
-        pieces = 1 + int(np.ceil(np.max(np.abs(straight) / self.found.step)))
+        pieces = 1 + int(np.ceil(np.max(np.abs(straight) / self.sublevel.step)))
         for _ in range(pieces - 1):
             at, reached = follow(self.mechanism, at, straight / pieces)
             if reached < 1.0 or self.height(at) > self.level:
@@ -271,8 +273,8 @@ class _Search:
         return reached == 1.0 and same_configuration(self.mechanism, end, there)
 
     def _lowest(self, value: Callable[[Kinematics], float], values: Array) -> Kinematics:
-        nodes, step = self.found.explored.nodes, self.found.step
-        return least(self.mechanism, nodes[int(np.argmin(values))], value, step, self._inside)
+        nodes, step = self.sublevel.explored.nodes, self.sublevel.step
+        return find_minimum(self.mechanism, nodes[int(np.argmin(values))], value, step, self._inside)
 
     def _failing(self, at: Kinematics) -> Kinematics | None:
         return at if self.fails(at) else None

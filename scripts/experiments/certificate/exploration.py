@@ -1,8 +1,8 @@
-"""One assembly branch over the independent coordinates, explored by continuation of sigma.
+"""Explore one assembly branch over the independent coordinates by continuation of sigma.
 
-For d = 1 and 2 a lattice is flooded from a closed configuration: neighbours are reached along rho and
-corrected by Newton, so that the branch is never left. For d > 2 a lattice would have too many points, and
-straight rays in random directions are followed instead: a sample of the part that the centre sees.
+For d = 1 and 2 a lattice is flooded from a closed configuration: neighbours are reached along rho and corrected by
+Newton's method, so the branch is never left. For d > 2 a lattice would have too many points. Straight rays in random
+directions are followed instead, which sample the part that is visible from the centre.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from scripts.experiments.certificate.branch_walk import Height, follow
 
 __all__ = ["End", "Explored", "explore"]
 
-RAYS = 300  # for d > 2
+RAYS = 300  # random directions, for d > 2
 MAX_POINTS = 30_000
 
 
 @dataclass(frozen=True)
 class End:
-    """Where a branch ends: the water level there, the node before it, the last configuration before it."""
+    """End of a branch: the water level there, and the last node and the last configuration before it."""
 
     water: float
     node: int
@@ -35,21 +35,21 @@ class End:
 
 @dataclass
 class Explored:
-    """The explored part of a branch, in the order in which rising water would reach it.
+    """The explored part of a branch, in the order in which a rising water level would reach it.
 
     Attributes
     ----------
     nodes : list of Kinematics
     water : list of float
-        The lowest level at which a node is connected to the centre: the largest height on the way to it.
+        The lowest level at which a node is connected to the centre, which is the largest height on the way to it.
     edges : list of (int, int)
         Neighbours among the nodes.
     ends : list of End
-        Where the branch ends inside the explored part.
+        Ends of the branch inside the explored part.
     sampled : bool
-        Rays instead of a lattice.
+        Whether rays were followed instead of a lattice.
     full : bool
-        The search was given up at MAX_POINTS.
+        Whether the exploration ended at MAX_POINTS.
     """
 
     nodes: list[Kinematics] = field(default_factory=list)
@@ -69,7 +69,7 @@ def explore(
     turn: IntArray | None = None,
     seed: int = 0,
 ) -> Explored:
-    """Explore the part of a branch around a configuration where a height stays at or below a level.
+    """Explore the connected part of a branch around a configuration where a height is at most a level.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def explore(
     centre : Kinematics
         Closed.
     step : (d,) array
-        The lattice's, or the rays', rad or m.
+        Of the lattice or the rays, rad or m.
     height : callable
-        Of a configuration on the branch; infinite where the search shall not go.
+        Of a configuration on the branch; infinite where it must not be explored.
     level : float
     turn : (d,) int array, optional
-        Steps of the lattice to a turn of each angle, after which it meets itself; 0 where it never does.
+        Steps of the lattice to a full turn of each coordinate, after which it is periodic; 0 if it is not.
     seed : int
-        Of the rays' directions, for d > 2.
+        Of the random directions, for d > 2.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""How large dh/dq of the reduced gravity vector gets (the paper's M_1), as far as a margin from singular.
+"""Bounds on dh/dq of the reduced gravity vector (the paper's M_1) at a margin from singular configurations.
 
-h = rho^T h' is the gradient of the potential along sigma, and rho grows without bound towards a singular
-configuration. So there is no M_1 over the whole non-singular workspace; there is one for each |s| >= s_min.
+h = rho^T h' is the gradient of the potential along sigma, and rho is unbounded near singular configurations. There is
+therefore no M_1 over the whole non-singular workspace, but one for each |s| >= s_min.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from ckc_pin.dynamics.equilibrium import h_gradient
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from scripts.experiments.certificate.branch_walk import Border, follow, least, margin, way
+from scripts.experiments.certificate.branch_walk import Border, find_minimum, follow, margin, wrapped_difference
 from scripts.experiments.certificate.exploration import Explored, explore
 
 __all__ = ["Bound", "bound_along", "chart_step", "explore_branch", "gradient_bounds", "symmetric_least"]
 
-STARTS, APART = 2, 2  # local searches start from so many points, so many steps of the lattice apart
+STARTS = 2  # of local searches
+MIN_START_DISTANCE = 2  # between them, steps of the lattice
 
 Value = Callable[[Mechanism, Kinematics], float]
 
@@ -39,15 +40,15 @@ class Bound:
     norm : float
         Largest spectral norm |dh/dq|, the paper's M_1: N m/rad between angles.
     norm_q : (d,) array
-        Where.
+        The configuration.
     low : float
-        Least eigenvalue of the symmetric part: what K_P has to outweigh.
+        Smallest eigenvalue of the symmetric part, which K_P has to outweigh.
     low_q : (d,) array
-        Where.
+        The configuration.
     points : int
-        How many configurations were looked at.
+        Number of configurations evaluated.
     sampled : bool
-        Along random rays instead of over a lattice.
+        Whether random rays were followed instead of a lattice.
     """
 
     margin: float
@@ -60,18 +61,18 @@ class Bound:
 
 
 def symmetric_least(matrix: Array) -> float:
-    """Least eigenvalue of the symmetric part of a matrix."""
+    """Return the smallest eigenvalue of the symmetric part of a matrix."""
     return float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[0])
 
 
 def chart_step(mechanism: Mechanism, divisions: int) -> Array:
-    """Return a turn of each angle, and the mechanism's size both ways for each length, in so many parts, (d,)."""
+    """Return the step (d,) of a lattice over a full turn of angles, and twice the mechanism's size for lengths."""
     metres = mechanism.tree.in_metres[mechanism.partition.q]
     return np.where(metres, 2 * mechanism.size, 2 * np.pi) / divisions
 
 
 def explore_branch(mechanism: Mechanism, branch: Kinematics, divisions: int) -> Explored:
-    """Explore all of a branch: a turn of every angle, lengths by the mechanism's size to either side."""
+    """Explore a whole branch: a full turn of every angle, lengths by the mechanism's size to both sides."""
     step = chart_step(mechanism, divisions)
     angles = ~mechanism.tree.in_metres[mechanism.partition.q]
     centre, reach = mechanism.independent_part(branch.q_tree), step * divisions / 2 * (1 + 1e-9)
@@ -86,9 +87,9 @@ def explore_branch(mechanism: Mechanism, branch: Kinematics, divisions: int) -> 
 def gradient_bounds(mechanism: Mechanism, explored: Explored, margins: Sequence[float], step: Array) -> list[Bound]:
     """Bound dh/dq on |s| >= s_min over an explored branch, for several s_min.
 
-    Where dh/dq grows towards singularity the bound is reached on the border |s| = s_min. So besides the nodes
-    inside, the points where its edges cross the border are solved for; from the most extreme of all
-    these a local search goes on, along the border where it has to.
+    If dh/dq grows towards a singular configuration, the bound is attained on the border |s| = s_min. Besides the nodes
+    inside, the points where edges cross the border are therefore computed. Local searches continue from the most
+    extreme points, along the border if necessary.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def gradient_bounds(mechanism: Mechanism, explored: Explored, margins: Sequence[
     Raises
     ------
     InputError
-        Nothing on the branch is as far from singular as that.
+        No configuration on the branch has that margin.
     """
     volumes = [margin(at) for at in explored.nodes]
     edges = [(i, explored.nodes[j], volumes[j]) for i, j in explored.edges]
@@ -125,25 +126,25 @@ def gradient_bounds(mechanism: Mechanism, explored: Explored, margins: Sequence[
 
 
 def _extreme(mechanism: Mechanism, ats: list[Kinematics], value: Value, step: Array, admit: Border) -> Kinematics:
-    """Search on from the lowest few that lie apart from each other."""
+    """Minimize a value from the lowest points that are not close to each other."""
     order = sorted(((value(mechanism, at), k) for k, at in enumerate(ats)))
     starts: list[Kinematics] = []
     for _, k in order:
-        if all(np.any(np.abs(way(mechanism, ats[k], at)) > APART * step) for at in starts):
+        if all(np.any(np.abs(wrapped_difference(mechanism, ats[k], at)) > MIN_START_DISTANCE * step) for at in starts):
             starts.append(ats[k])
         if len(starts) == STARTS:
             break
-    found = [least(mechanism, at, lambda x: value(mechanism, x), step, admit) for at in starts]
-    return min(found, key=lambda at: value(mechanism, at))
+    minima = [find_minimum(mechanism, at, lambda x: value(mechanism, x), step, admit) for at in starts]
+    return min(minima, key=lambda at: value(mechanism, at))
 
 
 def bound_along(mechanism: Mechanism, desired: Desired, times: Iterable[float]) -> Bound:
-    """Bound dh/dq along a trajectory of the independent coordinates; its margin is the least |s| on the way.
+    """Bound dh/dq along a trajectory of the independent coordinates; its margin is the smallest |s| on it.
 
     Raises
     ------
     InputError
-        It leaves the branch of the assembled configuration.
+        The trajectory leaves the branch of the assembled configuration.
     """
     ats, at = [], mechanism.assembled
     for t in times:
@@ -159,13 +160,13 @@ def _crossing(mechanism: Mechanism, a: Kinematics, b: Kinematics, s_min: float) 
     """Solve for |s| = s_min on the straight line between two neighbours."""
     from scipy.optimize import brentq
 
-    straight = way(mechanism, a, b)
+    straight = wrapped_difference(mechanism, a, b)
 
-    @cache  # both ends are asked for again
+    @cache  # both ends are evaluated twice
     def gap(fraction: float) -> float:
         return margin(follow(mechanism, a, fraction * straight)[0]) - s_min
 
-    if gap(1.0) * gap(0.0) > 0:  # the neighbour was reached another way round: there is no crossing on this line
+    if gap(1.0) * gap(0.0) > 0:  # the neighbour was reached by another route, so this line has no crossing
         return a if gap(0.0) > 0 else b
     return follow(mechanism, a, float(brentq(gap, 0.0, 1.0, xtol=1e-6)) * straight)[0]
 

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from ckc_pin.kinematics.sigma import sigma
-from scripts.experiments.certificate.branch_walk import follow, least, margin, same_configuration, way
+from scripts.experiments.certificate.branch_walk import (
+    find_minimum,
+    follow,
+    margin,
+    same_configuration,
+    wrapped_difference,
+)
 from scripts.experiments.certificate.exploration import explore
 from scripts.experiments.tests.set_point_cases import pendulum
 from tests.conftest import Pair, assert_close
@@ -50,7 +56,7 @@ def test_rays_stay_below_the_level() -> None:
 
 def test_least_goes_down_to_a_constrained_minimum() -> None:
     mechanism = pendulum(2)
-    found = least(
+    found = find_minimum(
         mechanism,
         sigma(mechanism, np.array([1.0, 1.0])).at,
         lambda at: float(1 + np.sum(at.q_tree**2)),
@@ -70,4 +76,4 @@ def test_follow_stops_where_the_loops_cannot_close(five_bar: Pair) -> None:
     assert_close(mechanism.independent_part(back.q_tree), [0.0, 0.5], 1e-12)
     turned = mechanism.kinematics(back.q_tree + np.array([0, 2 * np.pi, 0, 0]))
     assert same_configuration(mechanism, back, turned)
-    assert_close(way(mechanism, back, turned), np.zeros(2), 1e-12)
+    assert_close(wrapped_difference(mechanism, back, turned), np.zeros(2), 1e-12)
