@@ -79,36 +79,36 @@ class ManyDigits:
 
     def configuration(self, q_tree: Any) -> list[Any]:
         """By joint: a number, or a rotation and a position."""
-        found: list[Any] = []
+        result: list[Any] = []
         for k, (*_, free) in enumerate(self.joints, 1):
             at = self.tree.model.joints[k].idx_q
             if not free:
-                found.append(mp.mpf(float(q_tree[at])))
+                result.append(mp.mpf(float(q_tree[at])))
                 continue
             x = exact(q_tree[at + 3 : at + 7])
             x = x / mp.sqrt(x @ x)
             s = hat(x[:3])
-            found.append((exact(np.eye(3)) + 2 * x[3] * s + 2 * (s @ s), exact(q_tree[at : at + 3])))
-        return found
+            result.append((exact(np.eye(3)) + 2 * x[3] * s + 2 * (s @ s), exact(q_tree[at : at + 3])))
+        return result
 
     def moved(self, q: list[Any], v: Vector, a: Vector, t: Any) -> list[Any]:
         """After a time t along the velocity v and its rate a, to second order."""
-        found: list[Any] = []
+        result: list[Any] = []
         for x, (_, at, free) in zip(q, self.joints, strict=True):
             if not free:
-                found.append(x + v[at] * t + a[at] * t * t / 2)
+                result.append(x + v[at] * t + a[at] * t * t / 2)
                 continue
             R, p = x
             (slide, spin), (slides, spins) = (v[at : at + 3], v[at + 3 : at + 6]), (a[at : at + 3], a[at + 3 : at + 6])
             slides = slides + hat(spin) @ slide
-            found.append((R @ turn(spin * t + spins * (t * t / 2)), p + R @ (slide * t + slides * (t * t / 2))))
-        return found
+            result.append((R @ turn(spin * t + spins * (t * t / 2)), p + R @ (slide * t + slides * (t * t / 2))))
+        return result
 
     def frames(self, q: list[Any]) -> list[tuple[Vector, Vector]]:
         """Rotation and origin of every body, the world first."""
-        found = [(exact(np.eye(3)), exact(np.zeros(3)))]
+        result = [(exact(np.eye(3)), exact(np.zeros(3)))]
         for k, (x, (parent, _, free)) in enumerate(zip(q, self.joints, strict=True)):
-            R, p = found[parent]
+            R, p = result[parent]
             R, p = R @ self.stands[k][0], p + R @ self.stands[k][1]
             if free:
                 R, p = R @ x[0], p + R @ x[1]
@@ -116,8 +116,8 @@ class ManyDigits:
                 R = R @ turn(self.axes[k][0] * x)
             else:
                 p = p + R @ self.axes[k][0] * x
-            found.append((R, p))
-        return found
+            result.append((R, p))
+        return result
 
     def numbers(self, q: list[Any]) -> tuple[Vector, Vector]:
         """What forces and loops see: centres of mass, springs' lengths and phi, stacked; and bodies' rotations."""
@@ -142,27 +142,27 @@ class ManyDigits:
         p = self._points(frames, anchors)
         e = [frames[j][0] @ exact(x) for j, x in zip(anchors.direction_joint, anchors.direction_local, strict=True)]
         r = [a - b for a, b in zip(p[: len(p) // 2], p[len(p) // 2 :], strict=True)]
-        found = np.full(self.closure.rows, mp.mpf(0), dtype=object)
+        result = np.full(self.closure.rows, mp.mpf(0), dtype=object)
         for group in self.closure.groups:
             if isinstance(group, Component):
-                found[group.out] = [e[d] @ r[k] for k, d in zip(group.pair, group.direction, strict=True)]
+                result[group.out] = [e[d] @ r[k] for k, d in zip(group.pair, group.direction, strict=True)]
             elif isinstance(group, Dot):
-                found[group.out] = [e[a] @ e[b] for a, b in zip(group.a, group.b, strict=True)]
+                result[group.out] = [e[a] @ e[b] for a, b in zip(group.a, group.b, strict=True)]
             elif isinstance(group, Distance):
                 length = exact(group.length)
-                found[group.out] = [(r[k] @ r[k] - x * x) / (2 * x) for k, x in zip(group.pair, length, strict=True)]
+                result[group.out] = [(r[k] @ r[k] - x * x) / (2 * x) for k, x in zip(group.pair, length, strict=True)]
             elif isinstance(group, Affine):
                 x = np.full(self.n, mp.mpf(0), dtype=object)
                 for value, (_, at, free) in zip(q, self.joints, strict=True):
                     if not free:
                         x[at] = value
-                found[group.out] = exact(group.matrix) @ x - exact(group.offset)
+                result[group.out] = exact(group.matrix) @ x - exact(group.offset)
             elif isinstance(group, RelativeLog):
                 ends = zip(group.joint_a, group.rotation_a, group.joint_b, group.rotation_b, strict=True)
-                found[group.out] = np.concatenate(
+                result[group.out] = np.concatenate(
                     [log((frames[a][0] @ exact(A)).T @ (frames[b][0] @ exact(B))) for a, A, b, B in ends]
                 )
-        return found
+        return result
 
     def acceleration(self, q: list[Any], v: Vector, u: Vector) -> tuple[Vector, Vector]:
         """Eq. 1's acceleration and multipliers."""
@@ -205,8 +205,8 @@ class ManyDigits:
             right[n + i] = -rates[at.stop + i]
             for j in range(n):
                 matrix[n + i, j], matrix[j, n + i] = J[i, j], -J[i, j]
-        found = np.array(list(mp.lu_solve(matrix, right)), dtype=object)
-        return found[:n], found[n:]
+        result = np.array(list(mp.lu_solve(matrix, right)), dtype=object)
+        return result[:n], result[n:]
 
     def along(self, q_tree: Any, v: Any, u: Any, by: tuple[Any, Any, Any]) -> tuple[Any, Any]:
         """Derivatives of acceleration and multipliers along steps of q', v' and u', as floats."""

@@ -58,7 +58,7 @@ def at_a_price(T: Array, u: Array, limit: Array, weights: Array, preload: Array)
     return np.asarray(lsq_linear(left, right, (-limit, limit), method="bvls", tol=1e-15).x)
 
 
-def test_it_is_the_nearest_within_limits() -> None:
+def test_allocation_is_the_nearest_torque_within_limits() -> None:
     kinds = {"free": 0, "limited": 0, "out of reach": 0}
     for seed in range(110):
         T, u, limit, weights, preload = problem = problems(seed)
@@ -98,17 +98,17 @@ def test_a_preload_is_its_projection_on_the_null_space() -> None:
     assert_close(weighted, [3.0, 1.0, 3.0], 1e-14)
 
 
-def test_it_hardly_jumps_where_u_goes_out_of_reach() -> None:
+def test_allocation_is_continuous_where_u_leaves_the_reachable_set() -> None:
     """By about give times the multipliers at the edge, in what the motors do together."""
     jumps = []
     for seed in range(60):
         T, u, limit, weights, preload = problems(seed)
         bounds = [(-x, x) if np.isfinite(x) else (None, None) for x in limit]
         cost = np.r_[np.zeros(len(limit)), -1.0]
-        found = linprog(cost, A_eq=np.c_[T, -u], b_eq=0 * u, bounds=[*bounds, (0, 1e3)], method="highs")
-        if found.x[-1] > 999:
+        program = linprog(cost, A_eq=np.c_[T, -u], b_eq=0 * u, bounds=[*bounds, (0, 1e3)], method="highs")
+        if program.x[-1] > 999:
             continue
-        before, after = (allocate(T, found.x[-1] * (1 + s) * u, limit, weights, preload) for s in (-1e-9, 1e-9))
+        before, after = (allocate(T, program.x[-1] * (1 + s) * u, limit, weights, preload) for s in (-1e-9, 1e-9))
         jumps.append(np.abs(T @ (after - before)).max() / (limit[np.isfinite(limit)].max() * np.abs(T).max()))
     assert len(jumps) > 30
     assert np.median(jumps) < 1e-5

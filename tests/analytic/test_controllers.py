@@ -42,7 +42,7 @@ def test_eq_21_as_harmonics() -> None:
             assert_close(ours, theirs, 1e-14)
 
 
-def test_set_point_with_the_right_and_a_wrong_model(five_bar: Pair) -> None:
+def test_set_point_torques_with_exact_and_wrong_model(five_bar: Pair) -> None:
     q_d = np.array([np.pi / 4, np.pi / 4])
     for name, model in (("five_bar", FIVE_BAR), ("five_bar_as_printed", AS_PRINTED)):
         ours, theirs = SetPoint(load(name), 10 * np.eye(2), np.eye(2), q_d), set_point(model, q_d)
@@ -53,7 +53,7 @@ def test_set_point_with_the_right_and_a_wrong_model(five_bar: Pair) -> None:
 
 
 @pytest.mark.parametrize("off", [0.0, 0.05])
-def test_tracking_with_the_right_and_a_wrong_model(five_bar: Pair, off: float) -> None:
+def test_tracking_torques_with_exact_and_wrong_model(five_bar: Pair, off: float) -> None:
     """The wrong one has other lengths: its rho, and with it the velocity in its C, are its own."""
     wrong = ControllerModel(load("five_bar_as_printed"), five_bar[0], "rho")
     for model, reference in ((None, FIVE_BAR), (wrong, AS_PRINTED)):
@@ -103,7 +103,7 @@ def test_lyapunov_of_tracking_is_eq_18(five_bar: Pair) -> None:
         assert_close(ours.lyapunov(t, terms, w), V, 1e-12)
 
 
-def test_lyapunov_of_the_set_point_falls_by_K_V_alone(five_bar: Pair) -> None:
+def test_set_point_lyapunov_function_decreases_by_K_V_only(five_bar: Pair) -> None:
     """dV/dt = -q_dot K_V q_dot along the closed loop: section II-B, with D, C, h in numpy."""
     q_d, K_P, K_V, step = np.array([np.pi / 4, np.pi / 4]), 10 * np.eye(2), np.diag([1.0, 2.0]), 1e-4
     ours = SetPoint(five_bar[0], K_P, K_V, q_d)

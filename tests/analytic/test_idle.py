@@ -28,7 +28,7 @@ def wires(frame: str) -> str:
     )
 
 
-def test_a_plate_on_three_wires_swings_about_itself(tmp_path: Path) -> None:
+def test_torsion_of_a_plate_on_three_wires_is_not_idle(tmp_path: Path) -> None:
     """Its centre stays where it is, but it rises: a bifilar pendulum's law, of three wires."""
     more = wires('[[loop]]\nname = "wire_{k}"\ntype = "distance"\nlength = 0.8\nframe_a = {{ link = "body", xyz = '
                  '[{x}, {y}, 0.0] }}\nframe_b = {{ link = "world", xyz = [{x}, {y}, 0.0] }}\n')  # fmt: skip
@@ -38,14 +38,14 @@ def test_a_plate_on_three_wires_swings_about_itself(tmp_path: Path) -> None:
     assert np.abs(rates - np.sqrt(2.0 * 9.81 * ROUND**2 / (0.03 * LONG))).min() < 1e-8
 
 
-def test_a_body_hung_by_a_point_above_its_centre_turns_unseen(tmp_path: Path) -> None:
+def test_spin_of_a_body_hung_above_its_centre_is_idle(tmp_path: Path) -> None:
     more = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
     more += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n'
     (idle,) = [warning for warning in load(hung(tmp_path, more)).warnings if "idle freedoms" in warning]
     assert idle.endswith(": root.rz")
 
 
-def test_springs_hold_what_they_are_on(tmp_path: Path) -> None:
+def test_freedoms_of_bodies_on_springs_are_not_idle(tmp_path: Path) -> None:
     more = '[[loop]]\nname = "ball"\ntype = "point"\nframe_a = { link = "body", xyz = [0.0, 0.0, 0.2] }\n'
     more += 'frame_b = { link = "world", xyz = [0.0, 0.0, -0.6] }\n[[spring]]\nstiffness = 3.0\n'
     more += 'frame_a = { link = "body", xyz = [0.1, 0.0, 0.0] }\nframe_b = { link = "world", xyz = [0.2, 0.3, -0.8] }\n'

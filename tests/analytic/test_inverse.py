@@ -39,7 +39,7 @@ def test_five_bar_along_eq_21(name: str, reference: FiveBar) -> None:
         assert_close(found.loop_wrenches["elbow"][k], [*forces, 0, 0, 0, 0], 1e-9 * max(1.0, np.abs(forces).max()))
 
 
-def test_torques_of_a_recorded_run_come_back(run) -> None:
+def test_inverse_dynamics_returns_the_torques_of_a_run(run) -> None:
     """And its accelerations are those of the appendix, its rates' differences."""
     recorded = run("five_bar/tracking", formulation="reduced")
     found = inverse_dynamics(recorded)
@@ -138,7 +138,7 @@ def test_four_bar_as_free_bodies() -> None:
         assert_close(found.loop_wrenches["coupler_pin"][k], [*pins[2], 0, 0, 0, 0], 1e-10 * scale)
 
 
-def test_at_its_dead_centre_a_rocker_drives_nothing(tmp_path: Path) -> None:
+def test_a_rocker_at_dead_centre_cannot_drive(tmp_path: Path) -> None:
     """Crank and coupler in line at t = 0.5 s: before, its torque is the crank's over the ratio of their rates."""
     in_line = CRANK + COUPLER
     dead = np.arccos((in_line**2 + GROUND**2 - ROCKER**2) / (2 * in_line * GROUND))
@@ -162,7 +162,7 @@ def test_at_its_dead_centre_a_rocker_drives_nothing(tmp_path: Path) -> None:
         assert_close(found.tau[k], crank.tau[k] / rates[2], 1e-9 * abs(found.tau[k, 0]))
 
 
-def test_a_rod_from_the_world_pulls_it_as_it_pulls_the_coupler(tmp_path: Path) -> None:
+def test_a_rod_to_the_world_has_equal_and_opposite_wrenches(tmp_path: Path) -> None:
     """The rocker as a rod without mass, either end first: on the world it is what the coupler gets, turned round."""
     forces = []
     for world_first in (True, False):
@@ -281,13 +281,13 @@ def test_recorded_motion_with_friction(tmp_path: Path) -> None:
     assert_close(found.joint_forces["slide"][:, 2], 2.0 * (a + 9.81), 1e-10)
 
 
-def test_at_rest_friction_is_left_out(tmp_path: Path) -> None:
+def test_friction_of_joints_at_rest_is_zero(tmp_path: Path) -> None:
     scene = lift(tmp_path)
     found = inverse_dynamics(scene, {"controller.desired.slide.harmonics": []})
     assert_close(found.tau, 2 * 9.81 - 3.0, 1e-12)
 
 
-def test_set_point_is_to_rest_there() -> None:
+def test_inverse_dynamics_of_a_set_point_holds_the_target() -> None:
     found = inverse_dynamics("five_bar/set_point")
     q_d = np.array([found.q_tree[0, 0], found.q_tree[0, 2]])
     assert_close(found.q_tree, np.tile(found.q_tree[0], (len(found.t), 1)), 1e-12)
@@ -295,7 +295,7 @@ def test_set_point_is_to_rest_there() -> None:
     assert_close(found.tau, np.tile(FIVE_BAR.h(FIVE_BAR.sigma(q_d)), (len(found.t), 1)), 1e-11)
 
 
-def test_preload_of_a_recorded_run_stays() -> None:
+def test_inverse_dynamics_keeps_the_preload_of_a_run() -> None:
     """Efforts that strain two arms against each other are among those recorded, not of least norm: they come back."""
     recorded = ckc_pin.simulate("two_ur5/lift", {"t_end": 0.05, "solver.output_dt": 0.01})
     mechanism = recorded.mechanism

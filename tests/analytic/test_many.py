@@ -12,7 +12,7 @@ MECHANISMS = ["five_bar", "delta", "three_rrr", "stewart", "andrews", "bricard",
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
-def test_many_configurations_are_each_one_of_them(name):
+def test_batch_evaluation_equals_single_configurations(name):
     mechanism = load(name)
     random = np.random.default_rng(3)
     steps = random.uniform(-1.0, 1.0, (20, mechanism.n))
@@ -26,7 +26,7 @@ def test_many_configurations_are_each_one_of_them(name):
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta", "three_rrr", "stewart"])
-def test_prescribed_rows_are_the_coordinates_and_the_place(name):
+def test_extended_rows_are_coordinates_and_position_of_the_point(name):
     mechanism = load(name)
     point = next(iter(mechanism.points))
     extended = extend_closure(mechanism, point)

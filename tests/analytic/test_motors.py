@@ -30,7 +30,7 @@ def five_bar_with(folder: Path, motors: str, independent: str = INDEPENDENT) -> 
     return load(folder / "mechanism.toml")
 
 
-def test_a_rotor_behind_a_gear(tmp_path: Path) -> None:
+def test_rotor_inertia_is_reflected_through_the_gear(tmp_path: Path) -> None:
     """Its energy is J (ratio theta_dot)^2 / 2: ratio^2 J on the diagonal of D' of eq. 24."""
     motors = """
 [[motor]]
@@ -75,7 +75,7 @@ speed_limit = 100.0
 
 
 @pytest.mark.parametrize("pair", list(combinations(range(4), 2)), ids=str)
-def test_q_takes_the_coordinates_with_motors(tmp_path: Path, pair: tuple[int, int]) -> None:
+def test_independent_coordinates_prefer_motors(tmp_path: Path, pair: tuple[int, int]) -> None:
     """In the motors' order, where the determinant of the other two columns of the appendix' J is not small."""
     names = [f"theta_{k + 1}" for k in pair[::-1]]
     mechanism = five_bar_with(tmp_path, f"actuated = {names}\n".replace("'", '"'), "")
@@ -85,7 +85,7 @@ def test_q_takes_the_coordinates_with_motors(tmp_path: Path, pair: tuple[int, in
     assert list(mechanism.independent) == names == list(mechanism.actuated)
 
 
-def test_q_leaves_out_motors_where_phi_z_would_be_singular(tmp_path: Path) -> None:
+def test_motors_stay_dependent_if_phi_z_would_be_singular(tmp_path: Path) -> None:
     """The distal links nearly in line: theta_1 and theta_3 do not determine the rest, one of the two does."""
     shipped = library() / "five_bar"
     (tmp_path / "five_bar.urdf").write_text((shipped / "five_bar.urdf").read_text("utf-8"), "utf-8")

@@ -46,7 +46,7 @@ def states(pair):
     return mechanism.independent_part(mechanism.q_tree) + np.random.default_rng(2).uniform(-0.4, 0.4, (8, 2))
 
 
-def test_forward(pair, states):
+def test_forward_kinematics_of_the_five_bar_and_delta(pair, states):
     mechanism, model = pair
     point = Point(mechanism)
     for q in states:
@@ -55,7 +55,7 @@ def test_forward(pair, states):
         assert_close(point.forward(dict(zip(mechanism.independent, q, strict=True))), point.forward(q), 0.0)
 
 
-def test_jacobian_and_its_rate(pair, states):
+def test_point_jacobian_and_its_derivative_match_differences(pair, states):
     mechanism, model = pair
     point, h = Point(mechanism), 1e-4
 
@@ -73,7 +73,7 @@ def test_jacobian_and_its_rate(pair, states):
         assert_close(point.jacobian_dot(at, q_dot) @ q_dot, [acceleration.real, acceleration.imag, 0.0], 1e-5)
 
 
-def test_inverse_finds_all_four_and_follows_one(pair, states):
+def test_inverse_kinematics_finds_four_solutions_and_follows_one_branch(pair, states):
     mechanism, model = pair
     point = Point(mechanism)
     for q in states:
@@ -88,7 +88,7 @@ def test_inverse_finds_all_four_and_follows_one(pair, states):
         assert np.all(np.sign(np.sin(followed.at.q_tree[[1, 3]])) == np.sign(np.sin(mechanism.q_tree[[1, 3]])))
 
 
-def test_inverse_of_the_delta_is_three_triangles():
+def test_inverse_kinematics_of_the_delta_matches_closed_form():
     """Rods of 0.45 m from elbows on circles of 0.18 m, about hinges 0.25 m out, to balls 0.04 m from the place."""
     mechanism = load("delta")
     point = Point(mechanism)
@@ -103,7 +103,7 @@ def test_inverse_of_the_delta_is_three_triangles():
             assert_close(np.linalg.norm(place + 0.04 * out - elbow), 0.45, 1e-9)
 
 
-def test_orientation_is_kept_where_the_place_leaves_it_open():
+def test_inverse_kinematics_keeps_a_free_orientation():
     mechanism = load("three_rrr")
     point = Point(mechanism)
     solution = point.inverse(point.position(mechanism.q_tree) + np.array([0.02, -0.03, 0.0]))
@@ -122,7 +122,7 @@ def test_orientation_is_kept_where_the_place_leaves_it_open():
         ({"w": 0.1}, "there are x, y, z"),
     ],
 )
-def test_places_that_cannot_be(pair, x, says):
+def test_unreachable_positions_are_rejected(pair, x, says):
     with pytest.raises(InputError, match=says):
         Point(pair[0]).inverse(x)
 
@@ -170,7 +170,7 @@ def test_a_table_of_the_tip(pair):
         make_desired({"point": "tip", "file": "x.csv"}, mechanism, sources, 4.0)
 
 
-def test_a_path_that_leaves(pair):
+def test_a_path_that_leaves_the_workspace_is_rejected(pair):
     """Straight down: the tip leaves where both chains are stretched, at a depth that Pythagoras knows."""
     mechanism, model = pair
     down = {"start": [model.base / 2, -0.5, 0.0], "end": [model.base / 2, -0.7, 0.0], "frequency": 1.0}
@@ -222,7 +222,7 @@ def test_interpolated_knots_equal_the_path(name, desired, t_end):
         ({"spiral": 1}, "spiral"),
     ],
 )
-def test_bad_paths(pair, desired, says):
+def test_invalid_paths_are_rejected(pair, desired, says):
     with pytest.raises(InputError, match=says):
         path(pair[0], **desired)
 

@@ -39,7 +39,7 @@ def stack():
     return sections
 
 
-def test_sections_reach_the_workspace_of_the_closed_form():
+def test_sections_match_the_closed_form_workspace():
     """Including three corners at the top that are connected only below."""
     sections = SectionStack(ckc_pin.load("delta"), None, ("x", "y")).fill_sections(4, 16)
     for grid in sections:
@@ -54,7 +54,7 @@ def test_sections_reach_the_workspace_of_the_closed_form():
     assert sections[-1].values[sections[-1].reached, 2].max() > -0.18
 
 
-def test_serial_curves_are_where_an_arm_and_its_rods_are_in_line(stack):
+def test_serial_curves_have_an_arm_in_line_with_its_rods(stack):
     for one in stack:
         assert {locus.kind for locus in one.loci} == {"serial"}
         for locus in one.loci:

@@ -29,7 +29,7 @@ def turned(angles: Array) -> Array:
     return np.angle(np.exp(1j * angles))
 
 
-def test_psi_and_its_jacobian(pair: Pair) -> None:
+def test_psi_stacks_phi_and_q(pair: Pair) -> None:
     mechanism, reference = pair
     for q_tree in np.random.default_rng(0).uniform(-np.pi, np.pi, (100, 4)):
         q = np.array([0.3, -0.2])
@@ -50,28 +50,28 @@ def test_rho_is_eq_5(pair: Pair) -> None:
         assert_close(at.rho, rho, 1e-12, relative=True)
 
 
-def test_sigma_is_the_two_circles_on_the_branch_of_the_start(pair: Pair) -> None:
+def test_sigma_equals_two_circle_intersection_on_the_start_branch(pair: Pair) -> None:
     """Wherever the circles meet, over the whole torus of q: det phi_z > 0 everywhere, as assembled."""
     mechanism, reference = pair
     nearest, reach = abs(reference.l[1] - reference.l[3]), reference.l[1] + reference.l[3]
     for q in random_q(2, 200):
         if nearest + 1e-3 < elbow_distance(reference, q) < reach - 1e-3:
-            found = sigma(mechanism, q)
-            assert found.verdict == "converged", f"sigma({q}): {found.reason}"
-            assert_close(turned(found.at.q_tree - reference.sigma(q)), 0, 1e-11)
-            assert_close(found.at.q_tree[Q], q, 1e-14)
-            assert_close(found.at.phi, 0, 1e-12)
+            solution = sigma(mechanism, q)
+            assert solution.verdict == "converged", f"sigma({q}): {solution.reason}"
+            assert_close(turned(solution.at.q_tree - reference.sigma(q)), 0, 1e-11)
+            assert_close(solution.at.q_tree[Q], q, 1e-14)
+            assert_close(solution.at.phi, 0, 1e-12)
 
 
-def test_sigma_on_a_moved_level_set(pair: Pair) -> None:
+def test_sigma_solves_for_a_level_set_w(pair: Pair) -> None:
     """phi = w is the same linkage with its right base moved by w."""
     mechanism, reference = pair
     w = np.array([0.01, -0.006])
     for q in mechanism.q_tree[Q] + np.random.default_rng(3).uniform(-0.5, 0.5, (50, 2)):
-        found = sigma(mechanism, q, w=w)
-        assert found.verdict == "converged"
-        assert_close(reference.phi(found.at.q_tree), w, 1e-12)
-        assert reference.s(found.at.q_tree) > 0
+        solution = sigma(mechanism, q, w=w)
+        assert solution.verdict == "converged"
+        assert_close(reference.phi(solution.at.q_tree), w, 1e-12)
+        assert reference.s(solution.at.q_tree) > 0
 
 
 def test_sigma_follows_from_level_to_level(pair: Pair) -> None:
@@ -95,42 +95,42 @@ def test_sigma_from_the_other_branch_stays_there(pair: Pair) -> None:
     mechanism, reference = pair
     start = mechanism.kinematics(reference.sigma(mechanism.q_tree[Q], branch=-1))
     for q in mechanism.q_tree[Q] + np.random.default_rng(4).uniform(-0.5, 0.5, (50, 2)):
-        found = sigma(mechanism, q, start)
-        assert found.verdict == "converged"
-        assert_close(turned(found.at.q_tree - reference.sigma(q, branch=-1)), 0, 1e-11)
+        solution = sigma(mechanism, q, start)
+        assert solution.verdict == "converged"
+        assert_close(turned(solution.at.q_tree - reference.sigma(q, branch=-1)), 0, 1e-11)
 
 
-def test_out_of_reach_is_said_with_the_miss(pair: Pair) -> None:
+def test_sigma_out_of_reach_reports_the_miss(pair: Pair) -> None:
     """Beyond l2 + l4 the nearest miss of the tips is what the distal links are too short by."""
     mechanism, reference = pair
     reach, seen = reference.l[1] + reference.l[3], 0
     for q in random_q(5, 60):
         gap = elbow_distance(reference, q) - reach
         if gap > 1e-3:
-            found = sigma(mechanism, q)
+            solution = sigma(mechanism, q)
             seen += 1
-            assert found.verdict == "out of reach"
-            assert 0 < found.reached < 1
-            assert_close(found.at.phi, 0, mechanism.tolerance)
-            assert gap / np.sqrt(2) * (1 - 1e-6) <= found.miss <= gap * (1 + 1e-6)
+            assert solution.verdict == "out of reach"
+            assert 0 < solution.reached < 1
+            assert_close(solution.at.phi, 0, mechanism.tolerance)
+            assert gap / np.sqrt(2) * (1 - 1e-6) <= solution.miss <= gap * (1 + 1e-6)
             with pytest.raises(ValueError, match="out of reach"):
                 reference.sigma(q)
     assert seen > 10
 
 
 @pytest.mark.parametrize("inside", [1e-2, 1e-4, 1e-6, 1e-8])
-def test_sigma_close_to_the_outer_singularity(pair: Pair, inside: float) -> None:
+def test_sigma_converges_close_to_the_outer_singularity(pair: Pair, inside: float) -> None:
     """Type 2: links 2 and 4 all but in line; z is then as the square root of the distance, and sigma finds it."""
     mechanism, reference = pair
     q = near_type_2(pair, inside)
-    found = sigma(mechanism, q)
-    assert found.verdict == "converged"
+    solution = sigma(mechanism, q)
+    assert solution.verdict == "converged"
     closed = reference.sigma(q)
-    assert_close(turned(found.at.q_tree - closed), 0, 1e-12 / abs(reference.s(closed)))
+    assert_close(turned(solution.at.q_tree - closed), 0, 1e-12 / abs(reference.s(closed)))
 
 
 @pytest.mark.parametrize("outside", [1e-3, 1e-5, 1e-7])
-def test_just_outside_is_out_of_reach(pair: Pair, outside: float) -> None:
+def test_sigma_just_outside_the_workspace_is_out_of_reach(pair: Pair, outside: float) -> None:
     mechanism, _ = pair
     assert sigma(mechanism, near_type_2(pair, -outside)).verdict == "out of reach"
 
@@ -144,7 +144,7 @@ def test_coincident_elbows_are_singular(five_bar: Pair) -> None:
         assert sigma(mechanism, q).verdict == "singular"
 
 
-def test_elbows_cannot_coincide_as_printed(pair: Pair) -> None:
+def test_elbows_of_unequal_links_cannot_coincide(pair: Pair) -> None:
     """Erratum 3: with |l2 - l4| = 0.0254 the same q is out of reach."""
     mechanism, reference = pair
     if reference.l[1] != reference.l[3]:
@@ -178,7 +178,7 @@ def test_loops_without_redundant_rows_are_closed_to_the_tolerance_and_no_further
     stale[Q] += [0.01, 0.005]
     open_by = np.abs(by_hand.phi(stale)).max()
     for tolerance in (2 * open_by, 0.5 * open_by):
-        found = newton(mechanism.kinematics(stale), 0.0, tolerance)
-        assert found.converged
-        assert found.iterations == (0 if open_by <= tolerance else 1)
-        assert 1e-8 < np.abs(by_hand.phi(found.at.q_tree)).max() <= tolerance
+        solution = newton(mechanism.kinematics(stale), 0.0, tolerance)
+        assert solution.converged
+        assert solution.iterations == (0 if open_by <= tolerance else 1)
+        assert 1e-8 < np.abs(by_hand.phi(solution.at.q_tree)).max() <= tolerance

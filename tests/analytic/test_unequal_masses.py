@@ -59,22 +59,22 @@ def chain(folder: Path, masses: list[float], closed: bool) -> Path:
 
 
 @pytest.mark.parametrize("name", CHAINS)
-def test_acceleration_has_all_digits(name: str, tmp_path: Path) -> None:
+def test_acceleration_of_unequal_masses_keeps_its_digits(name: str, tmp_path: Path) -> None:
     """Where the motion goes on from after a hundredth of a second."""
     ready = prepare(load_scene(chain(tmp_path, *CHAINS[name]), {"formulation": "dae", "solver.rtol": 1e-6}))
     ready.begin()
     ready.loop.advance(0.01, True, 1.0, 10.0)
     y, n = ready.loop.y, ready.mechanism.n
-    found = ready.loop.rhs(0.01, y)[n:]
+    computed = ready.loop.rhs(0.01, y)[n:]
     model = ManyDigits(ready.mechanism)
     right, _ = model.acceleration(model.configuration(y[:n]), exact(y[n:]), exact(np.zeros(n)))
     right = np.array(right, dtype=float)
-    assert np.abs(found - right).max() <= 1e-12 * np.abs(right).max()
+    assert np.abs(computed - right).max() <= 1e-12 * np.abs(right).max()
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
 @pytest.mark.parametrize("name", CHAINS)
-def test_finer_tolerances_take_more_steps_as_their_order_says(name: str, formulation: str, tmp_path: Path) -> None:
+def test_step_count_grows_with_tolerance_as_the_order_predicts(name: str, formulation: str, tmp_path: Path) -> None:
     """A thousandth of the tolerance takes 10^(3/8) = 2.4 times the steps with a method of order eight."""
     folder = chain(tmp_path, *CHAINS[name])
     coarse, fine = (

@@ -18,21 +18,21 @@ def apart(swing: float, frequency: float) -> Harmonics:
 
 
 @pytest.mark.parametrize("turns", [3.3, 100.0, 1000.0])
-def test_however_quick_a_motion_is_it_is_seen_to_leave(turns: float) -> None:
+def test_fast_desired_motions_are_seen_to_leave_the_workspace(turns: float) -> None:
     """It is outside for 2 % of each turn; the samples of a thousand turns must not see all of them at one phase."""
     w = 2 * np.pi * turns
-    found = follow_desired(load("five_bar"), apart(1.002 * EDGE, w), 1.0)
-    assert found.leaves_at == pytest.approx(np.arcsin(1 / 1.002) / w, rel=1e-9)
-    assert found.until == found.leaves_at
+    result = follow_desired(load("five_bar"), apart(1.002 * EDGE, w), 1.0)
+    assert result.leaves_at == pytest.approx(np.arcsin(1 / 1.002) / w, rel=1e-9)
+    assert result.until == result.leaves_at
 
 
-def test_of_a_motion_that_is_too_quick_to_be_followed_to_its_end_it_is_said_how_far() -> None:
-    found = follow_desired(load("five_bar"), apart(0.9 * EDGE, 2 * np.pi * 1e4), 1.0)
-    assert found.leaves_at is None
-    assert 100 < 1e4 * found.until < 1000
+def test_check_reports_how_far_a_very_fast_motion_was_followed() -> None:
+    result = follow_desired(load("five_bar"), apart(0.9 * EDGE, 2 * np.pi * 1e4), 1.0)
+    assert result.leaves_at is None
+    assert 100 < 1e4 * result.until < 1000
 
 
-def test_a_tables_quickest_wave_is_about_that_which_it_was_made_of() -> None:
+def test_highest_frequency_of_a_table_matches_its_sampled_wave() -> None:
     random, t = np.random.default_rng(0), np.linspace(0.0, 3.0, 2001)
     for _ in range(5):
         slow, quick = random.uniform(1.0, 2.0), random.uniform(10.0, 40.0)

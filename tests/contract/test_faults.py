@@ -22,7 +22,7 @@ def shipped(file: str) -> Any:
     return tomllib.loads((library() / file).read_text(encoding="utf-8"))
 
 
-def test_all_faults_of_a_file_are_found() -> None:
+def test_all_errors_of_a_file_are_found() -> None:
     data = shipped("five_bar/tracking.scene.toml")
     data |= {"t_end": -1, "formulation": "ode", "event": [{"of": "v"}, {"coordinat": "theta_1"}]}
     data["controller"] |= {"K_D": [[1.0, "a"], [0.0, 1.0]], "sample_time": True}
@@ -55,7 +55,7 @@ def test_one_message_names_all_places_and_counts_what_it_leaves_out() -> None:
     assert said.endswith(" and 4 more")  # of the loop: its type, name, frame_a and frame_b
 
 
-def test_a_key_that_was_meant_is_not_missing_as_well() -> None:
+def test_a_misspelled_key_is_not_also_missing() -> None:
     (fault,) = find_faults({"lnk": "tip"}, FrameSpec)
     assert (fault.kind, fault.value, fault.suggestion) == ("unknown key", "lnk", "link")
 
@@ -65,12 +65,12 @@ def test_choices_are_those_of_the_type() -> None:
     assert fault.choices == tuple(sorted(get_args(LoopType)))
 
 
-def test_entries_wrong_in_one_way_are_named_once() -> None:
+def test_list_entries_with_the_same_error_are_reported_once() -> None:
     found = [fault.path for fault in find_faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
     assert found == [("gravity", 0)]
 
 
-def test_keys_that_are_no_strings() -> None:
+def test_keys_that_are_not_strings_are_rejected() -> None:
     with pytest.raises(InputError, match=r"robot.yaml: .*str"):
         convert({1: "a"}, RobotYaml, "robot.yaml")
 
@@ -81,7 +81,7 @@ def test_keys_that_are_no_strings() -> None:
      (MechanismSpec, "five_bar/mechanism.toml"), (MechanismSpec, "two_ur5/mechanism.toml"),
      (MechanismSpec, "flyball/mechanism.toml")],
 )  # fmt: skip
-def test_there_is_a_fault_exactly_where_data_do_not_fit(kind: Any, file: str) -> None:
+def test_faults_agree_with_msgspec(kind: Any, file: str) -> None:
     r, given, refused = random.Random(5), shipped(file), 0
     if "q_guess" in given:
         given["q_guess"] = {key: value for key, value in given["q_guess"].items() if not isinstance(value, dict)}

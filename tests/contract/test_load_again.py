@@ -1,4 +1,4 @@
-"""A mechanism that is loaded again is copied: faster, and still nobody else's."""
+"""Mechanisms that are loaded again come from a cache as independent copies."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_copies_have_separate_workspaces() -> None:
 
 
 def test_workspace_is_allocated_on_demand() -> None:
-    """It has some n^3 numbers, and what is kept to be copied needs none."""
+    """A workspace takes about n^3 numbers, and the mechanisms of the cache have none."""
     load("delta")
     assert all("data" not in vars(kept.tree) for kept in loading.cache.values())
     again = load("delta")
@@ -96,7 +96,7 @@ def test_cache_has_a_limited_size(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_immutable_data_are_shared() -> None:
-    """A copy of what is frozen is itself, its arrays being read-only; tables and springs are everybody's own."""
+    """Immutable parts are shared and their arrays are read-only. Tables and springs are copied."""
     one, other = load("five_bar"), load("five_bar")
     assert other.closure is one.closure
     assert other.partition is one.partition

@@ -236,3 +236,14 @@ def test_playback_is_an_embedded_page(swing: Run, tmp_path: Path) -> None:
     assert server is not None
     assert not isinstance(server, Playback)
     server.stop()
+
+
+def test_dir_lists_public_names_only() -> None:
+    assert {name for name in dir(ckc_pin) if not name.startswith("__")} == set(ckc_pin.__all__)
+
+
+def test_a_point_prints_its_body_and_position() -> None:
+    text = repr(ckc_pin.Point(ckc_pin.load("five_bar"), "tip"))
+    assert text.startswith("Point tip of five_bar")
+    assert "link_2" in text
+    assert "x, y" in text

@@ -94,7 +94,7 @@ every_type = pytest.mark.parametrize("kind", TYPES)
 
 @every_type
 @given(seed=seeds, data=st.data())
-def test_phi_is_the_table(kind: LoopType, seed: int, data: st.DataObject) -> None:
+def test_phi_of_each_loop_type_matches_the_definition(kind: LoopType, seed: int, data: st.DataObject) -> None:
     world, loop = random_world(seed), data.draw(loops(kind))
     q = world.configuration()
     A, B = placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)
@@ -141,7 +141,7 @@ def test_a_coupling_is_affine(seed: int, ratio: float, offset: float, prismatic:
 
 
 @given(seed=seeds, data=st.data())
-def test_rows_keep_the_order_of_the_file(seed: int, data: st.DataObject) -> None:
+def test_rows_follow_the_order_of_the_loops(seed: int, data: st.DataObject) -> None:
     """Loops of all types and a coupling at once: grouping rows by primitive must not show."""
     world = random_world(seed)
     specs = [data.draw(loops(kind)) for kind in data.draw(st.permutations(TYPES))]
@@ -158,7 +158,7 @@ def test_rows_keep_the_order_of_the_file(seed: int, data: st.DataObject) -> None
 
 
 @given(seed=seeds, turn=st.floats(0, 0.2) | st.floats(0, np.pi - 1e-6))
-def test_a_weld_off_by_a_turn(seed: int, turn: float) -> None:
+def test_weld_rows_are_the_rotation_vector(seed: int, turn: float) -> None:
     """The log up to its cut at half a turn, and its derivatives through the series for small angles."""
     world = random_world(seed)
     q, v, axis = world.configuration(), world.velocity(), world.random.normal(size=3)

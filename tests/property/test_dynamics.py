@@ -25,7 +25,7 @@ many = settings(max_examples=25)
 
 @many
 @given(every_mechanism)
-def test_energy_is_that_of_the_bodies(closed: Closed) -> None:
+def test_energy_is_the_sum_over_bodies(closed: Closed) -> None:
     """1/2 v D' v + V against a sum over bodies that are placed in numpy, and over rotors."""
     mechanism, world = closed.mechanism, closed.world
     q, v = world.configuration(), world.velocity()
@@ -88,7 +88,7 @@ def test_D_is_symmetric_positive_definite(closed: Closed) -> None:
 
 @many
 @given(every_mechanism)
-def test_the_bias_is_C_v_and_h(closed: Closed) -> None:
+def test_bias_is_C_v_plus_h(closed: Closed) -> None:
     terms = closed.near()
     assert_close(terms.bias_tree, terms.C_tree @ terms.v_tree + terms.h_tree, 1e-11)
 
@@ -120,7 +120,7 @@ def test_dae_is_the_reduced_model(closed: Closed) -> None:
 
 @many
 @given(every_mechanism)
-def test_both_ways_to_eq_6_agree_on_the_manifold(closed: Closed) -> None:
+def test_eq_6_with_and_without_C_agree_on_the_manifold(closed: Closed) -> None:
     """Without the matrix C', and with it at a given q_dot."""
     terms, u_tree = closed.near(), closed.u_tree()
     q_ddot = reduced_acceleration(terms, u_tree)
@@ -184,7 +184,7 @@ def other_partition(at: Kinematics) -> Partition:
 
 
 @given(kind=st.sampled_from(TYPES), seed=seeds, rpy=angles, free=st.booleans())
-def test_the_dynamics_do_not_depend_on_where_the_world_looks(
+def test_dynamics_do_not_depend_on_the_orientation_of_the_world(
     kind: str, seed: int, rpy: tuple[float, float, float], free: bool
 ) -> None:
     """Everything turned, gravity too: the same phi and J in frame A's axes, the same D', C', h' and motion."""
@@ -203,7 +203,7 @@ def test_the_dynamics_do_not_depend_on_where_the_world_looks(
 
 @many
 @given(every_mechanism)
-def test_the_tangent_basis(closed: Closed) -> None:
+def test_tangent_basis_spans_the_null_space_of_J(closed: Closed) -> None:
     """What J annihilates, one freedom each and none large; the particular part takes up J_dot v."""
     terms = closed.near()
     tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree)
@@ -226,9 +226,9 @@ def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None
     q = mechanism.independent_part(at.q_tree)
 
     def h(x: Array) -> Array:
-        found = sigma(mechanism, x, at)
-        assert found.verdict == "converged"
-        return Terms(mechanism, found.at, np.zeros(mechanism.n)).h
+        computed = sigma(mechanism, x, at)
+        assert computed.verdict == "converged"
+        return Terms(mechanism, computed.at, np.zeros(mechanism.n)).h
 
     hessian = h_gradient(mechanism, at)
     slopes = np.array([slope(lambda t, e=e: h(q + t * e)) for e in np.eye(mechanism.d)]).T

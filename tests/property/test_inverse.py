@@ -84,7 +84,7 @@ def test_every_body_obeys_newton_and_euler(closed: Closed) -> None:
 
 @many
 @given(every_mechanism)
-def test_along_its_axis_a_joint_transmits_what_acts_in_it(closed: Closed) -> None:
+def test_axial_joint_wrench_is_the_actuator_and_passive_torque(closed: Closed) -> None:
     """Effort, joint spring and damper, coupling; the rotor takes its share of the effort for itself."""
     terms, u_tree, acceleration, forces = moving(closed)
     mechanism, tree = closed.mechanism, closed.mechanism.tree
@@ -117,12 +117,12 @@ def test_multipliers_of_the_motion_balance_the_tree(closed: Closed) -> None:
 
 @many
 @given(every_mechanism, st.floats(0.1, 5.0))
-def test_friction_opposes_what_slides_and_leaves_what_rests(closed: Closed, size: float) -> None:
+def test_friction_opposes_sliding_and_is_zero_at_rest(closed: Closed, size: float) -> None:
     mechanism, random = closed.mechanism, closed.world.random
     mechanism.joints.friction = size * random.uniform(0, 1, mechanism.n)
     v_tree = random.uniform(-1, 1, mechanism.n)
     v_tree[0] = 0.0
-    found = friction_force(mechanism, v_tree)
-    assert found[0] == 0
-    assert_close(found[1:], np.where(v_tree[1:] > 0, -1, 1) * mechanism.joints.friction[1:], 0)
+    computed = friction_force(mechanism, v_tree)
+    assert computed[0] == 0
+    assert_close(computed[1:], np.where(v_tree[1:] > 0, -1, 1) * mechanism.joints.friction[1:], 0)
     assert_close(friction_force(mechanism, np.zeros(mechanism.n)), 0, 0)

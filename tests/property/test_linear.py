@@ -24,7 +24,7 @@ every_mechanism = st.builds(
 
 @settings(max_examples=12)
 @given(every_mechanism)
-def test_it_is_the_flow_and_the_forces_of_eq_1_to_first_order(closed: Closed) -> None:
+def test_linear_model_is_the_first_order_of_eq_1(closed: Closed) -> None:
     mechanism, state, random = closed.mechanism, closed.near(), np.random.default_rng(5)
     tree, rank = mechanism.tree, mechanism.rank
     tau = random.uniform(-1, 1, len(mechanism.actuated))

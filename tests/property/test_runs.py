@@ -36,7 +36,7 @@ worlds = pytest.mark.parametrize("world", WORLDS, ids=lambda w: f"{w[0]}{'-free'
 
 
 @worlds
-def test_every_formulation_moves_the_same(tmp_path: Path, world: tuple[LoopType, int, bool, bool]) -> None:
+def test_all_formulations_have_the_same_motion(tmp_path: Path, world: tuple[LoopType, int, bool, bool]) -> None:
     kind, seed, free, redundant = world
     closed = closed_mechanism(kind, seed, free=free, redundant=redundant)
     ways = WAYS if free else WAYS | EQ_8
@@ -51,7 +51,7 @@ def test_every_formulation_moves_the_same(tmp_path: Path, world: tuple[LoopType,
         assert run.max_phi <= 1e-12
 
 
-def test_eq_8_as_printed_refuses_free_roots(tmp_path: Path) -> None:
+def test_spf_in_z_rejects_free_roots(tmp_path: Path) -> None:
     """Its z are numbers of joints; a free root has none whose rates are its velocity."""
     with pytest.raises(InputError, match=r"eq\. 8 as printed"):
         swing(tmp_path, closed_mechanism("hinge", 2, free=True), t_end=0.01, **EQ_8["eq. 8"])
@@ -67,7 +67,7 @@ def test_energy_is_conserved_without_dampers(tmp_path: Path, world: tuple[LoopTy
 
 
 @worlds
-def test_dampers_take_energy_away(tmp_path: Path, world: tuple[LoopType, int, bool, bool]) -> None:
+def test_dampers_dissipate_energy(tmp_path: Path, world: tuple[LoopType, int, bool, bool]) -> None:
     """At the rate v . damping_force, integrated along the run."""
     kind, seed, free, redundant = world
     run = swing(tmp_path, closed_mechanism(kind, seed, free=free, redundant=redundant), formulation="dae")

@@ -24,10 +24,10 @@ SLIDES = re.compile(r"(?m)^(?P<before>slider = )(?P<numbers>.*)$")
 def times(pattern: re.Pattern[str], text: str, factor: float) -> str:
     """Multiply the numbers that a pattern finds."""
 
-    def larger(found: re.Match[str]) -> str:
-        separator = ", " if "," in found["numbers"] else " "
-        numbers = found["numbers"].replace(",", " ").split()
-        return found["before"] + separator.join(repr(float(number) * factor) for number in numbers)
+    def larger(computed: re.Match[str]) -> str:
+        separator = ", " if "," in computed["numbers"] else " "
+        numbers = computed["numbers"].replace(",", " ").split()
+        return computed["before"] + separator.join(repr(float(number) * factor) for number in numbers)
 
     return pattern.sub(larger, text)
 
@@ -61,7 +61,7 @@ def motion(folder: Path, name: str, length: float, mass: float, formulation: str
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
 @pytest.mark.parametrize("name", STARTS)
-def test_sizes_and_masses_do_not_matter(tmp_path: Path, name: str, formulation: str) -> None:
+def test_motion_is_invariant_to_size_and_mass(tmp_path: Path, name: str, formulation: str) -> None:
     right = motion(tmp_path / "right", name, 1.0, 1.0, formulation, 1e-11)
     for k, (length, mass) in enumerate([(1e-6, 1e-12), (1e-3, 1e3), (1e3, 1e-3), (1e6, 1e12)]):
         for rtol in (1e-4, 1e-8):

@@ -48,7 +48,7 @@ def ours(pair: Pair, q_tree: Array, q_dot: Array, u: Array, epsilon: float, conv
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
 @given(seed=seeds, epsilon=epsilons)
-def test_both_conventions_off_the_manifold(
+def test_spf_terms_use_the_velocity_of_each_convention(
     five_bar: Pair, convention: CoriolisVelocity, seed: int, epsilon: float
 ) -> None:
     q_tree, q_dot, u = random_state(seed, 0.05)
@@ -64,7 +64,7 @@ def test_z_dot_is_the_second_line_of_eq_8(five_bar: Pair, seed: int, epsilon: fl
 
 
 @given(seed=seeds, epsilon=epsilons)
-def test_phi_decays_whatever_q_does(five_bar: Pair, seed: int, epsilon: float) -> None:
+def test_phi_decays_exponentially_for_any_q_dot(five_bar: Pair, seed: int, epsilon: float) -> None:
     """phi_dot = -phi / epsilon along the actual velocity: eq. 17's second line."""
     q_tree, q_dot, _ = random_state(seed, 0.05)
     at = five_bar[0].kinematics(q_tree)
@@ -73,7 +73,7 @@ def test_phi_decays_whatever_q_does(five_bar: Pair, seed: int, epsilon: float) -
 
 
 @given(seed=seeds)
-def test_on_the_manifold_both_are_the_reduced_model(five_bar: Pair, seed: int) -> None:
+def test_spf_on_the_manifold_is_the_reduced_model(five_bar: Pair, seed: int) -> None:
     """With w = 0 epsilon and the convention do not matter."""
     mechanism, _ = five_bar
     q_tree, q_dot, u = random_state(seed, 0.0)
@@ -86,7 +86,7 @@ def test_on_the_manifold_both_are_the_reduced_model(five_bar: Pair, seed: int) -
 
 
 @given(seed=seeds)
-def test_off_the_manifold_they_differ_by_one_over_epsilon(five_bar: Pair, seed: int) -> None:
+def test_conventions_differ_by_one_over_epsilon_off_the_manifold(five_bar: Pair, seed: int) -> None:
     """From a moving start: what the notes measure not to converge. The difference is linear in 1/epsilon."""
     q_tree, q_dot, u = random_state(seed, 0.05)
     gaps = [

@@ -31,7 +31,7 @@ def lengths(world: World, q: dict[str, float]) -> tuple[float, float]:
 
 @many
 @given(worlds)
-def test_energy_of_springs(closed: Closed) -> None:
+def test_spring_energy_matches_lengths(closed: Closed) -> None:
     q = closed.world.configuration()
     q_tree = closed.mechanism.tree.from_coordinates(np.array([q[name] for name in closed.mechanism.coordinates]))
     first, second = lengths(closed.world, q)
@@ -61,7 +61,7 @@ def test_elastic_gradient_is_minus_the_slope_of_the_force(closed: Closed) -> Non
 
 @many
 @given(worlds)
-def test_dampers_take_the_power_of_their_rates(closed: Closed) -> None:
+def test_damping_power_matches_elongation_rates(closed: Closed) -> None:
     """-damping * rate^2, summed."""
     world, mechanism = closed.world, closed.mechanism
     q, v = world.configuration(), world.velocity()
