@@ -198,13 +198,7 @@ def _with_meta(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
         content = {name: data[name] for name in data.files}
     meta = json.loads(content["meta"].tobytes())
     change(meta)
-<<<<<<< HEAD
     hashes = hashes_of(RunMeta(**{k: v for k, v in meta.items() if k != "hashes"}))  # as an attacker can do
-=======
-    hashes = hashes_of(
-        RunMeta(**{k: v for k, v in meta.items() if k != "hashes"})
-    )  # an attacker can compute the hashes, too
->>>>>>> 2d8f5f6 (Name tests of analytic models and properties after what they assert)
     content["meta"] = np.frombuffer(json.dumps(meta | {"hashes": hashes}).encode(), dtype=np.uint8)
     np.savez(path, **content)
 
