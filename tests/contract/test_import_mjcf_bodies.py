@@ -1,4 +1,4 @@
-"""`ckc import` of a MuJoCo model's bodies: masses, meshes, springs, motors, names, and notes on what is left out."""
+"""`ckc import` of a MuJoCo model's bodies: masses, meshes, springs, motors, names, and notes on omissions."""
 
 from __future__ import annotations
 
@@ -152,8 +152,8 @@ def test_disabled_friction_and_ranges_are_noted(tmp_path: Path, flag: str) -> No
     joint = "<joint name='j' range='-1 2' frictionloss='0.5'/>"
     draft = model(tmp_path, f"<body name='b'>{joint}<geom size='.1'/></body>", f"<option><flag {flag}/></option>")
     disabled = {"dry friction": not flag.startswith("limit"), "ranges of joints": not flag.startswith("friction")}
-    for effect, is_disabled in disabled.items():
-        assert has_note(draft.left_out, f"the model's flag that disables {effect}") is is_disabled
+    for feature, is_disabled in disabled.items():
+        assert has_note(draft.left_out, f"the model's flag that disables {feature}") is is_disabled
 
 
 def test_unsupported_armature_is_noted(tmp_path: Path) -> None:
@@ -262,13 +262,13 @@ def test_included_file_is_part_of_the_model(tmp_path: Path) -> None:
     assert model(tmp_path, "<include file='arm.xml'/>").build_mechanism().coordinates == ("j",)
 
 
-def test_disabled_gravity_is_zero_and_other_disabled_effects_are_noted(tmp_path: Path) -> None:
+def test_disabled_gravity_is_zero_and_other_disabled_features_are_noted(tmp_path: Path) -> None:
     body = "<body name='b'><joint name='j'/><geom size='.1'/></body>"
     flags = "gravity='disable' spring='disable' equality='disable' contact='disable'"
     draft = model(tmp_path, body, f"<option><flag {flags}/></option>")
     assert draft.gravity == (0.0, 0.0, 0.0)
     disabled = ("springs", "equality constraints")
-    assert draft.left_out == [f"the model's flag that disables {effect}: they act here" for effect in disabled]
+    assert draft.left_out == [f"the model's flag that disables {feature}: they act here" for feature in disabled]
 
 
 def test_unused_sites_are_points(tmp_path: Path) -> None:

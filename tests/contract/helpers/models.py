@@ -34,7 +34,7 @@ WORKSHOP = """<mujoco model="workshop">
 <tendon>
   <spatial name="elastic" stiffness="35" springlength="0.15" damping="1.5">
     <site site="pull"/><site site="tip_1"/></spatial>
-  <spatial name="slack" stiffness="20"><site site="hook"/><site site="tip_2"/></spatial>
+  <spatial name="cord" stiffness="20"><site site="hook"/><site site="tip_2"/></spatial>
   <spatial name="dashpot" damping="4"><site site="hook"/><site site="pull"/></spatial>
   <spatial name="rod"><site site="hook"/><site site="tip_0"/></spatial>
   <fixed name="belt"><joint joint="swing_1" coef="2"/><joint joint="swing_2" coef="-0.5"/></fixed>
