@@ -8,8 +8,7 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.spec import LoopSpec, LoopType, MechanismSpec, PointSpec
-
-INERTIA = '<inertial><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+from scripts.experiments.mechanism_files import PlanarLink, planar_chain, urdf_robot
 
 
 def linkage(
@@ -18,34 +17,26 @@ def linkage(
     independent: Sequence[str],
     loop: LoopType = "point_2d",
 ) -> Mechanism:
-    """Return a linkage with joints a1, a2, ..., b1, ...
+    """Return a linkage of chains whose tips are joined to the first chain's, which is the point "tip".
 
     Parameters
     ----------
     chains : sequence of (float, sequence of float)
-        Start on the x axis and lengths of the links of each chain, m.
+        Where each chain starts on the x axis, and the lengths of its links, m. Joints are a1, a2, ..., b1, ...
     guess : sequence of float
-        Angles at which assembly starts, rad.
+        Angles at which assembly starts, rad, in the order of the joints.
     independent : sequence of str
-    loop : str
-        Type of the loops that join each tip to the first chain's tip, which is the point "tip".
+    loop : LoopType
     """
-    links, joints, names = ['<link name="base"/>'], [], []
+    elements, names = ['  <link name="base"/>'], []
     for letter, (start, lengths) in zip("abc", chains, strict=False):
-        parent, x = "base", start
-        for k, length in enumerate([*lengths, None], 1):
-            child = f"{letter}_link_{k}" if length is not None else f"{letter}_tip"
-            kind, axis = ("revolute", '<axis xyz="0 0 1"/>') if length is not None else ("fixed", "")
-            limit = '<limit lower="-100" upper="100" effort="1" velocity="1"/>' if length is not None else ""
-            links.append(f'<link name="{child}">{INERTIA if length is not None else ""}</link>')
-            name = f"{letter}{k}" if length is not None else f"{letter}_end"
-            joints.append(
-                f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-                f'<origin xyz="{x} 0 0"/>{axis}{limit}</joint>'
-            )
-            names += [name] if length is not None else []
-            parent, x = child, length or 0.0
-    urdf = f'<robot name="linkage">{"".join(links + joints)}</robot>'
+        links = [
+            PlanarLink(f"{letter}{k}", f"{letter}_link_{k}", length, 0.0, 1.0, (0.01, 0.01, 0.01))
+            for k, length in enumerate(lengths, 1)
+        ]
+        elements += planar_chain(start, links, f"{letter}_end", f"{letter}_tip", "revolute")
+        names += [link.joint for link in links]
+    urdf = urdf_robot("linkage", elements)
     spec = MechanismSpec(
         name="linkage",
         urdf="linkage.urdf",

@@ -1,4 +1,4 @@
-"""Random spatial mechanisms that close: a loop of a given type, put where a random configuration closes it."""
+"""Random spatial mechanisms with a loop of a given type, whose frames coincide at a random configuration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics import Terms
@@ -24,6 +23,7 @@ from ckc_pin.mechanism.spec import (
     SpringSpec,
     TreeSpec,
 )
+from scripts.experiments.mechanism_files import closing_frame, roll_pitch_yaw
 from tests.analytic.five_bar import Array
 from tests.property.worlds import Numbers, World, random_world, rotation, slope
 
@@ -48,7 +48,7 @@ ROTORS = [
 
 @dataclass(frozen=True)
 class Closed:
-    """A mechanism, the world it was made of, and the configuration that closes it."""
+    """A mechanism, the world that it is built from, and a closed configuration."""
 
     mechanism: Mechanism
     world: World
@@ -61,7 +61,7 @@ class Closed:
         return bool(np.abs(at.rho).max() < LARGEST_RHO / 2 and at.sigma_min() > 2 * LEAST_SIGMA)
 
     def near(self, spread: float = 0.1) -> Terms:
-        """A random state on the closure, not far from the assembled configuration."""
+        """Return a random state with closed loops near the assembled configuration."""
         random, mechanism = self.world.random, self.mechanism
         at = mechanism.assembled
         while spread > 1e-3:
@@ -75,7 +75,7 @@ class Closed:
         raise AssertionError(f"no regular configuration near the assembled one: {found}")
 
     def u_tree(self) -> Array:
-        """Random generalized forces on the tree."""
+        """Return random generalized forces on the tree."""
         return self.world.random.uniform(-5, 5, self.mechanism.n)
 
 
@@ -88,7 +88,7 @@ def closed_mechanism(
     turn: Array | None = None,
     rows_in: RowsIn = "a",
 ) -> Closed:
-    """A world with a loop between the links a_3 and b_3, a coupling, springs and dampers, rotors on joints.
+    """Return a world with a loop between the links a_3 and b_3, a coupling, springs, dampers and rotors.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def closed_mechanism(
     turn = np.eye(3) if turn is None else turn
     trees = [
         TreeSpec(file=prefix, prefix=prefix, root="free" if prefix == "b_" and free else "fixed",
-                 xyz=_triple(turn @ xyz), rpy=_rpy(turn @ rotation(rpy)))
+                 xyz=_triple(turn @ xyz), rpy=_triple(roll_pitch_yaw(turn @ rotation(rpy))))
         for prefix, (xyz, rpy) in world.stands.items()
     ]  # fmt: skip
     again = [LoopSpec(**{name: getattr(loop, name) for name in loop.__struct_fields__} | {"name": "again"})]
@@ -126,17 +126,18 @@ def closed_mechanism(
 
 
 def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> LoopSpec:
-    """A loop whose frame B is where its frame A is at q, apart from what its type leaves free."""
+    """Return a loop that is closed at q."""
     random = world.random
     inside, axis = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
     across = np.cross(axis, random.normal(size=3))
-    (R_A, p_A), (R_B, p_B) = world.placement("a_3", q), world.placement("b_3", q)
-    apart = LENGTH * across / np.linalg.norm(across) if kind == "distance" else np.zeros(3)
+    placement_a, placement_b = world.placement("a_3", q), world.placement("b_3", q)
+    offset = LENGTH * across / np.linalg.norm(across) if kind == "distance" else np.zeros(3)
+    xyz, rpy = closing_frame(placement_a, placement_b, inside + offset)
     return LoopSpec(
         name="loop",
         type=kind,
         frame_a=FrameSpec(link="a_3", xyz=_triple(inside)),
-        frame_b=FrameSpec(link="b_3", xyz=_triple(R_B.T @ (p_A + R_A @ (inside + apart) - p_B)), rpy=_rpy(R_B.T @ R_A)),
+        frame_b=FrameSpec(link="b_3", xyz=_triple(xyz), rpy=_triple(rpy)),
         rows_in=rows_in,
         axis_a=_triple(axis),
         axis_b=_triple(across if kind == "universal" else axis),
@@ -145,14 +146,10 @@ def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> 
 
 
 def along(mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array]) -> Array:
-    """Derivative of f(q') along a tangent velocity, by differences."""
+    """Return the derivative of f(q') along a tangent velocity, by differences."""
     return slope(lambda t: f(mechanism.tree.integrate(q_tree, t * v_tree)))
 
 
 def _triple(vector: Array) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
-
-
-def _rpy(R: Array) -> tuple[float, float, float]:
-    return _triple(Rotation.from_matrix(R).as_euler("xyz"))

@@ -12,7 +12,7 @@ import pytest
 from ckc_pin import InputError, Run, simulate
 from ckc_pin.dynamics import Terms
 from ckc_pin.mechanism.spec import LoopType
-from scripts.experiments.fuzz.build import toml
+from scripts.experiments.mechanism_files import toml_value
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
 from tests.property.mechanisms import SPRINGS, Closed, closed_mechanism
@@ -105,7 +105,7 @@ def swing(folder: Path, closed: Closed, *, damped: bool = True, **overrides: Any
     }
     for name, content in (("mechanism.toml", spec), ("swing.scene.toml", scene)):
         (folder / name).write_text(
-            "\n".join(f"{key} = {toml(x)}" for key, x in content.items() if x is not None), "utf-8"
+            "\n".join(f"{key} = {toml_value(x)}" for key, x in content.items() if x is not None), "utf-8"
         )
     for prefix in closed.world.stands:
         (folder / prefix).write_text(closed.world.urdf(prefix), "utf-8")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scripts.experiments.fuzz.build import link, words
+from scripts.experiments.mechanism_files import urdf_joint, urdf_link
 from tests.analytic.five_bar import Array
 
 Placement = tuple[Array, Array]  # rotation (3, 3), translation (3,)
@@ -125,14 +125,13 @@ class World:
     def urdf(self, prefix: str) -> str:
         """The tree as URDF, its names without the prefix."""
         base = self.root_body
-        parts = [link("0", base.mass, base.com, base.inertia) if prefix == "b_" else '<link name="0"/>']
+        parts = [urdf_link("0", base.mass, base.com, base.inertia) if prefix == "b_" else '<link name="0"/>']
         for joint in self.trees[prefix]:
             name = joint.name.removeprefix(prefix)
+            body, limit = joint.body, '<limit lower="-9" upper="9" effort="0" velocity="0"/>'
             parts += [
-                link(name[1:], joint.body.mass, joint.body.com, joint.body.inertia),
-                f'<joint name="{name}" type="{joint.kind}"><parent link="{joint.parent}"/><child link="{name[1:]}"/>'
-                f'<origin xyz="{words(joint.xyz)}" rpy="{words(joint.rpy)}"/><axis xyz="{words(joint.axis)}"/>'
-                '<limit lower="-9" upper="9" effort="0" velocity="0"/></joint>',
+                urdf_link(name[1:], body.mass, body.com, body.inertia),
+                urdf_joint(name, joint.kind, joint.parent, name[1:], joint.xyz, joint.rpy, joint.axis, limit),
             ]
         return f'<robot name="tree">{"".join(parts)}</robot>'
 

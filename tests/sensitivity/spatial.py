@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from scripts.experiments.mechanism_files import closing_frame, toml_value
+
 ARM = """
   <link name="{s}0">{body}</link><link name="{s}1">{body}</link><link name="{s}bend">{body}</link>
   <link name="{s}2">{body}</link><link name="{s}tip">{body}</link><link name="{s}hand">{body}</link>
@@ -77,10 +79,6 @@ INDEPENDENT = {  # independent coordinates by type of loop
 }
 
 
-def format_list(numbers: object) -> str:
-    return str([float(x) for x in numbers])  # type: ignore[attr-defined]
-
-
 def write_arms(folder: Path, kind: str, formulation: str = "dae", more: str = "") -> str:
     """Write the files of two arms whose loop is closed at Q; return the scene's path."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -95,16 +93,19 @@ def write_arms(folder: Path, kind: str, formulation: str = "dae", more: str = ""
     for name, value in {**Q, "w": 0.2 - 0.7 * Q["la"]}.items():
         q[model.joints[model.getJointId(name)].idx_q] = value
     pin.framesForwardKinematics(model, data, q)
-    tip = data.oMf[model.getFrameId("lhand")] * pin.SE3(
-        pin.rpy.rpyToMatrix(0.2, 0.1, -0.3), np.array([0.1, 0.05, 0.02])
+    hand, tip = (data.oMf[model.getFrameId(link)] for link in ("lhand", "rtip"))
+    xyz, rpy = closing_frame(
+        (hand.rotation, hand.translation),
+        (tip.rotation, tip.translation),
+        np.array([0.1, 0.05, 0.02]),
+        pin.rpy.rpyToMatrix(0.2, 0.1, -0.3),
     )
-    other = data.oMf[model.getFrameId("rtip")].actInv(tip)
     axis = np.array([0.0, 0.6, 0.8]) if kind != "universal" else np.array([1.0, 0.0, 0.0])
     names = INDEPENDENT[kind]
     (folder / "arms.toml").write_text(
         MECHANISM.format(
-            type=kind, xyz=format_list(other.translation), rpy=format_list(pin.rpy.matrixToRpy(other.rotation)),
-            axis_b=format_list(axis), independent=", ".join(f'"{x}"' for x in names),
+            type=kind, xyz=toml_value(xyz), rpy=toml_value(rpy),
+            axis_b=toml_value(axis), independent=", ".join(f'"{x}"' for x in names),
             guess=", ".join(f"{k} = {x}" for k, x in Q.items()),
         ) + more,
         encoding="utf-8",

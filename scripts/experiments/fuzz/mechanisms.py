@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from scripts.experiments.fuzz.build import Builder, angles
+from scripts.experiments.fuzz.build import Builder
 from scripts.experiments.fuzz.spatial import Array, rotation
+from scripts.experiments.mechanism_files import closing_frame
 
 __all__ = ["RandomMechanism", "random_mechanism"]
 
@@ -80,23 +81,24 @@ def _chain(builder: Builder, name: str, count: int, flat: Array | None, parent: 
 def _close(builder: Builder, kind: str, a: str, b: str, flat: Array | None, name: str = "loop") -> None:
     """A loop between two links, which the guess closes."""
     random = builder.random
-    (R_A, p_A), (R_B, p_B) = builder.placement(a), builder.placement(b)
+    placement_a, placement_b = builder.placement(a), builder.placement(b)
     inside = builder.turns[a].T @ builder.vector(0.6, flat)
     axis = random.normal(size=3) if flat is None else builder.turns[a].T @ flat
     across = np.cross(axis, random.normal(size=3))
     across /= np.linalg.norm(across)
     length = float(builder.scale * random.uniform(0.2, 0.8))
-    apart = np.zeros(3)
+    offset = np.zeros(3)
     if kind == "distance":
-        apart = length * across
-    elif kind in ("cylindrical", "prismatic"):  # what slides along the axis may be off
-        apart = axis / np.linalg.norm(axis) * builder.scale * random.uniform(-0.2, 0.2)
-        apart = apart if kind == "cylindrical" else np.zeros(3)
+        offset = length * across
+    elif kind in ("cylindrical", "prismatic"):  # a prismatic loop draws a number too, so that seeds stay the same
+        offset = axis / np.linalg.norm(axis) * builder.scale * random.uniform(-0.2, 0.2)
+        offset = offset if kind == "cylindrical" else np.zeros(3)
+    xyz, rpy = closing_frame(placement_a, placement_b, inside + offset)
     loop: dict[str, Any] = {
         "name": name,
         "type": kind,
         "frame_a": {"link": a, "xyz": inside},
-        "frame_b": {"link": b, "xyz": R_B.T @ (p_A + R_A @ (inside + apart) - p_B), "rpy": angles(R_B.T @ R_A)},
+        "frame_b": {"link": b, "xyz": xyz, "rpy": rpy},
     }
     if kind == "distance":
         loop["length"] = length

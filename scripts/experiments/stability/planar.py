@@ -1,9 +1,11 @@
-"""Five-bars of any lengths, masses and springs, written as the files that a user would write."""
+"""Files of five-bars with any lengths, masses and springs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from scripts.experiments.mechanism_files import PlanarLink, planar_chain, urdf_robot
 
 __all__ = ["JointSpring", "LineSpring", "Planar"]
 
@@ -32,7 +34,7 @@ class JointSpring:
 
 @dataclass(frozen=True)
 class Planar:
-    """A five-bar in chain numbering (1, 2 left, 3, 4 right, proximal first); as it stands the paper's, `five_bar`.
+    """A five-bar in chain numbering (1, 2 left, 3, 4 right, proximal first); the defaults are the paper's, `five_bar`.
 
     Attributes
     ----------
@@ -69,25 +71,17 @@ class Planar:
 
     def write(self, folder: Path) -> None:
         """Write `mechanism.toml` and its URDF into a folder."""
-        links = "\n".join(_LINK.format(k=k + 1, c=c, m=m, I=I, thin=I / 100) for k, (c, m, I) in enumerate(self._rods))
-        l = self.l
-        joints = "\n".join(
-            _JOINT.format(name=name, kind=kind, parent=parent, child=child, x=x)
-            for name, kind, parent, child, x in (
-                ("theta_1", "continuous", "base", "link_1", 0.0),
-                ("theta_2", "continuous", "link_1", "link_2", l[0]),
-                ("theta_3", "continuous", "base", "link_3", self.base),
-                ("theta_4", "continuous", "link_3", "link_4", l[2]),
-                ("left_end", "fixed", "link_2", "tip_left", l[1]),
-                ("right_end", "fixed", "link_4", "tip_right", l[3]),
-            )
-        )
-        (folder / "five_bar.urdf").write_text(_URDF.format(links=links, joints=joints), encoding="utf-8")
+        links = [
+            PlanarLink(f"theta_{k + 1}", f"link_{k + 1}", l, c, m, (I / 100, I, I))
+            for k, (l, c, m, I) in enumerate(zip(self.l, self.c, self.m, self.I, strict=True))
+        ]
+        elements = [
+            '  <link name="base"/>',
+            *planar_chain(0.0, links[:2], "left_end", "tip_left", "continuous"),
+            *planar_chain(self.base, links[2:], "right_end", "tip_right", "continuous"),
+        ]
+        (folder / "five_bar.urdf").write_text(urdf_robot("five_bar", elements), encoding="utf-8")
         (folder / "mechanism.toml").write_text(_MECHANISM.format(g=self.g) + self._springs(), encoding="utf-8")
-
-    @property
-    def _rods(self) -> list[tuple[float, float, float]]:
-        return list(zip(self.c, self.m, self.I, strict=True))
 
     def _springs(self) -> str:
         text = ""
@@ -131,31 +125,3 @@ frame_a = "tip_left"
 frame_b = "tip_right"
 rows_in = "world"
 """
-
-_URDF = """\
-<?xml version="1.0" encoding="utf-8"?>
-<robot name="five_bar">
-  <link name="base"/>
-  <link name="tip_left"/>
-  <link name="tip_right"/>
-{links}
-{joints}
-</robot>
-"""
-
-_LINK = """\
-  <link name="link_{k}">
-    <inertial>
-      <origin xyz="{c!r} 0 0"/>
-      <mass value="{m!r}"/>
-      <inertia ixx="{thin!r}" iyy="{I!r}" izz="{I!r}" ixy="0" ixz="0" iyz="0"/>
-    </inertial>
-  </link>"""
-
-_JOINT = """\
-  <joint name="{name}" type="{kind}">
-    <parent link="{parent}"/>
-    <child link="{child}"/>
-    <origin xyz="{x!r} 0 0"/>
-    <axis xyz="0 0 1"/>
-  </joint>"""

@@ -13,11 +13,12 @@ import numpy as np
 import ckc_pin
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
-from scripts.experiments.fuzz.build import Builder, toml
+from scripts.experiments.fuzz.build import Builder
 from scripts.experiments.fuzz.contact.cases import RTOL, Case, choose_restitutions, mass_ratio
 from scripts.experiments.fuzz.contact.stops import Contact
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array, rotation
+from scripts.experiments.mechanism_files import toml_value
 
 __all__ = ["draw_closed", "draw_jammed", "draw_pendulums"]
 
@@ -176,7 +177,7 @@ def _with_motors(
         return dict(texts)
     tables = "".join(
         "\n[[motor]]\n"
-        + "".join(f"{key} = {toml(value)}\n" for key, value in {
+        + "".join(f"{key} = {toml_value(value)}\n" for key, value in {
             "joint": name, "ratio": float(random.uniform(1, 20)),
             "torque_limit": float(size.max() * 10 ** random.uniform(-2, 0)),
         }.items())

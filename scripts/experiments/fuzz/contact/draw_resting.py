@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from scripts.experiments.fuzz.build import toml, words
 from scripts.experiments.fuzz.contact.cases import Case, choose_restitutions
 from scripts.experiments.fuzz.contact.stops import Contact
 from scripts.experiments.fuzz.spatial import Array
+from scripts.experiments.mechanism_files import format_numbers, toml_value
 
 __all__ = ["draw_gripper", "draw_truss"]
 
 
 def _link(name: str, com: Array, mass: float, moment: float) -> str:
     return (
-        f'  <link name="{name}"><inertial><origin xyz="{words(com)}"/><mass value="{mass!r}"/>'
+        f'  <link name="{name}"><inertial><origin xyz="{format_numbers(com)}"/><mass value="{mass!r}"/>'
         f'<inertia ixx="{moment!r}" iyy="{moment!r}" izz="{moment!r}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
     )
 
@@ -22,7 +22,7 @@ def _link(name: str, com: Array, mass: float, moment: float) -> str:
 def _joint(name: str, kind: str, parent: str, child: str, xyz: Array, rpy: Array, axis: Array) -> str:
     return (
         f'  <joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{words(xyz)}" rpy="{words(rpy)}"/><axis xyz="{words(axis)}"/></joint>'
+        f'<origin xyz="{format_numbers(xyz)}" rpy="{format_numbers(rpy)}"/><axis xyz="{format_numbers(axis)}"/></joint>'
     )
 
 
@@ -50,11 +50,11 @@ def draw_truss(seed: int, random: np.random.Generator) -> Case:
     ]
     kind = str(random.choice(["hinge", "point", "cylindrical"]))
     mechanism = (
-        f'name = "truss"\nurdf = "truss.urdf"\ngravity = {toml(random.normal(size=3) * 5)}\n[q_guess]\n'
+        f'name = "truss"\nurdf = "truss.urdf"\ngravity = {toml_value(random.normal(size=3) * 5)}\n[q_guess]\n'
         + "".join(f"{key} = {value!r}\n" for key, value in angles.items())
         + f'[[loop]]\nname = "tip"\ntype = "{kind}"\n'
-        f'frame_a = {{link = "A", xyz = {toml([float(a), 0.0, 0.0])}}}\n'
-        f'frame_b = {{link = "B", xyz = {toml([float(b), 0.0, 0.0])}}}\n'
+        f'frame_a = {{link = "A", xyz = {toml_value([float(a), 0.0, 0.0])}}}\n'
+        f'frame_b = {{link = "B", xyz = {toml_value([float(b), 0.0, 0.0])}}}\n'
     )
     contacts = {}
     for (name, angle), e in zip(angles.items(), choose_restitutions(random, 2), strict=True):
@@ -102,9 +102,9 @@ def draw_gripper(seed: int, random: np.random.Generator) -> Case:
         turn, axis = np.array([0.0, 0.0, 2 * np.pi * k / count]), np.array([0.0, flips[k], 0.0])
         parts.append(_link(f"finger{k}", zero, mass, 1e-4 * mass))
         parts.append(_joint(name, "prismatic", parent, f"finger{k}", at, turn, axis))
-    mechanism = f'name = "gripper"\nurdf = "gripper.urdf"\ngravity = {toml(random.normal(size=3) * 6)}\n'
+    mechanism = f'name = "gripper"\nurdf = "gripper.urdf"\ngravity = {toml_value(random.normal(size=3) * 6)}\n'
     independent = [f"a{k}" for k in range(moved)] + (names[:1] if coupled else names)
-    mechanism += f"independent = {toml(independent)}\n"
+    mechanism += f"independent = {toml_value(independent)}\n"
     couplings = [(k, 0) for k in range(1, count)] if coupled else []
     if len(couplings) == 2 and random.random() < 0.4:
         couplings.append((2, 1))  # follows from the others

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from scripts.experiments.fuzz.build import toml
 from scripts.experiments.fuzz.contact.cases import RTOL, Case, choose_restitutions, mass_ratio
 from scripts.experiments.fuzz.contact.stops import Contact
 from scripts.experiments.fuzz.spatial import Array
+from scripts.experiments.mechanism_files import toml_value
 
 __all__ = ["draw_racks", "draw_stack", "draw_tree"]
 
@@ -127,11 +127,11 @@ def draw_racks(seed: int, random: np.random.Generator) -> Case:
         one, other = (geared - 1, geared - 2) if geared > 2 else (1, 0)
         couplings.append((one, other, ratios[one] / ratios[other]))
     tables = "".join(
-        "[[coupling]]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in table.items())
+        "[[coupling]]\n" + "".join(f"{key} = {toml_value(value)}\n" for key, value in table.items())
         for table in ({"joint": f"x{k}", "other": f"x{of}", "ratio": float(r)} for k, of, r in couplings)
     )
     free = ["x0", *(f"x{k}" for k in range(geared, count))]
-    tables = f"independent = {toml(free)}\n{tables}"
+    tables = f"independent = {toml_value(free)}\n{tables}"
     if jammed and not v[0]:
         v[0] = random.choice([-1.0, 1.0])
     v[:geared] = v[0] * ratios
