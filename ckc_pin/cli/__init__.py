@@ -1,14 +1,13 @@
-"""The commands: parse, call, print. The only place that knows exit codes.
+"""Command line: parse arguments, call the package, print the result. Only this room knows exit codes.
 
-`main` is the entry point of the process, `app` finds the command; each group of commands is a module, which is imported
-when one of its commands is called.
+`main` is the entry point of the process. `app` finds the command, and imports the module that defines it.
 """
 
 from __future__ import annotations
 
 from ckc_pin.cli.signals import interrupts
 
-TYPE_CHECKING = False  # importing `typing` would delay the handlers of signals
+TYPE_CHECKING = False  # Importing `typing` would delay the installation of signal handlers.
 if TYPE_CHECKING:
     from typing import NoReturn
 
@@ -16,8 +15,8 @@ __all__ = ["main"]
 
 
 def main() -> NoReturn:
-    """Handle signals, then import everything else, run the command line of this process and end the process."""
+    """Install signal handlers, then import everything else, run the command line and end the process."""
     interrupts.install(loading=True)
-    from ckc_pin.cli.app import main as run
+    from ckc_pin.cli.app import main as run_command_line
 
-    interrupts.exit(run())
+    interrupts.exit(run_command_line())

@@ -1,4 +1,4 @@
-"""``python -m ckc_pin.cli`` is ``ckc``."""
+"""Run the command line by ``python -m ckc_pin.cli``."""
 
 from ckc_pin.cli import main
 

@@ -1,10 +1,11 @@
-"""What commands print: one JSON object or a table on standard output, everything else on standard error."""
+"""Output of commands: one JSON object or a table on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from shutil import get_terminal_size
@@ -13,68 +14,93 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.base.summary import to_json
+from ckc_pin.cli.signals import STOPPED, interrupt_code
 from ckc_pin.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
+    from rich.table import Table
 
     from ckc_pin.base.summary import Summary
 
-__all__ = [
-    "LONG",
-    "ProgressBar",
-    "Working",
-    "errors",
-    "forget_answer",
-    "has_answered",
-    "kept",
-    "make_folder",
-    "on_terminal",
-    "print_json",
-    "print_summary",
-    "print_table",
-]  # fmt: skip
+__all__ = ["LONG_S", "ProgressBar", "Spinner", "create_table", "error_console", "exit_unless_done",
+           "format_destination", "has_printed_json", "is_terminal", "make_folder", "print_json", "print_summary",
+           "print_table", "print_written", "reset_json", "skip_figures_without_matplotlib"]  # fmt: skip
+
+LONG_S = 10.0  # a command that may take longer announces it
+ESTIMATE_DELAY_S = 2.0  # the remaining time is estimated from the progress in this time
+SPINNER_DELAY_S = 1.0  # operations that take less show no spinner
 
 
-LONG = 10.0  # s: what may take longer says so before
-FIRST_LOOK = 2.0  # s: from what was done until then the rest is estimated
-SOON = 1.0  # s: what takes longer shows that it is at work
+# --- standard error ------------------------------------------------------------------------------
 
 
 @cache
-def errors() -> Console:
-    """Standard error, for people; a command that has nothing to say there loads no rich."""
+def error_console() -> Console:
+    """Return the console of standard error. It is created on first use, so that other commands do not import rich."""
     from rich.console import Console
 
     return Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
-def on_terminal() -> bool:
-    """Whether somebody is looking on."""
-    return sys.stderr.isatty() and errors().is_terminal
+def is_terminal() -> bool:
+    """Return whether standard error is a terminal."""
+    return sys.stderr.isatty() and error_console().is_terminal
 
 
-_answers: list[str] = []  # the object of --json, once its printing has begun
+@contextmanager
+def skip_figures_without_matplotlib() -> Iterator[None]:
+    """Print the InputError of a body that draws figures instead of raising it: the command's result is saved."""
+    try:
+        yield
+    except InputError as error:
+        error_console().print(f"no figures: {error}")
+
+
+def exit_unless_done(status: str, message: str) -> None:
+    """Print the message and exit with code 3, 130 or 143 if a result's status is "stopped" or "interrupted"."""
+    import click
+
+    sys.stdout.flush()
+    if status != "done":
+        error_console().print(message)
+        raise click.exceptions.Exit(STOPPED if status == "stopped" else interrupt_code(message))
+
+
+# --- standard output -----------------------------------------------------------------------------
+
+
+_printed_json: list[str] = []  # the object of --json, from the moment when it begins to be printed
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """Print the one object of --json."""
-    _answers.append(to_json(data))
-    print(_answers[-1])
+    """Print the object of --json."""
+    _printed_json.append(to_json(data))
+    print(_printed_json[-1])
 
 
-def has_answered() -> bool:
-    """Return whether printing the object of --json has begun."""
-    return bool(_answers)
+def has_printed_json() -> bool:
+    """Return whether the object of --json has been printed, at least in part."""
+    return bool(_printed_json)
 
 
-def forget_answer() -> None:
-    """Begin another command line in this process."""
-    _answers.clear()
+def reset_json() -> None:
+    """Prepare for another command line in the same process."""
+    _printed_json.clear()
+
+
+def create_table(*titles: str, right: tuple[str, ...] = ()) -> Table:
+    """Return an empty table without frame; the columns `right` are aligned to the right."""
+    from rich.table import Table
+
+    table = Table(*titles, box=None, show_header=any(titles) or bool(right), pad_edge=False)
+    for title in right:
+        table.add_column(title, justify="right")
+    return table
 
 
 def print_table(table: RenderableType) -> None:
-    """Print what is for people."""
+    """Print a table on standard output."""
     from rich.console import Console
 
     Console(highlight=False, markup=False, emoji=False).print(table)
@@ -85,13 +111,25 @@ def print_summary(summary: Summary) -> None:
     print(summary.text(get_terminal_size().columns, None))
 
 
-def kept(out: Path | None, what: str) -> str:
-    """Say where results went, or would go."""
-    return f"not saved: --out DIR keeps {what}" if out is None else f"written to {out}"
+def print_written(paths: list[Path]) -> None:
+    """Print the files that were written."""
+    for path in paths:
+        print(f"written: {path}")
+
+
+def format_destination(out: Path | None, content: str) -> str:
+    """Return where results were written, or which content --out would save."""
+    return f"not saved: --out DIR keeps {content}" if out is None else f"written to {out}"
 
 
 def make_folder(out: Path, option: str = "--out ") -> None:
-    """Find out before a run, not after it, whether it can be saved; `option` is what the command calls the folder."""
+    """Create a folder and check before a computation that files can be written to it.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written to. `option` is the command's name of it.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
@@ -99,72 +137,80 @@ def make_folder(out: Path, option: str = "--out ") -> None:
         raise InputError(f"{option}{out}: no folder that can be written to: {error.strerror}") from None
 
 
-class ProgressBar:
-    """A bar on a terminal, with the time that is left; in a pipe one line, if it is going to take more than `LONG`.
+# --- progress ------------------------------------------------------------------------------------
 
-    Entering it gives a function of how far it is and how far it will be.
+
+class ProgressBar:
+    """Progress bar with the remaining time. Its context value is a callback that takes progress and total.
+
+    Without a terminal one line is printed instead, if the command is going to take more than `LONG_S`.
     """
 
-    def __init__(self, title: str, says: str = "t = {task.completed:.2f} s") -> None:
-        self.title, self.says = title, says
+    def __init__(self, title: str, label: str = "t = {task.completed:.2f} s") -> None:
+        self.title, self.label = title, label
         self.bar: Any = None
-        self.first: tuple[float, float] | None = None  # when it was first heard of, and how far it was
-        self.said = False
+        self.first_call: tuple[float, float] | None = None  # time and progress
+        self.has_estimated = False
+
+    @classmethod
+    def percentage(cls, title: str) -> ProgressBar:
+        """Return a bar that shows the progress in per cent."""
+        return cls(title, "{task.percentage:.0f} %")
 
     def __enter__(self) -> Callable[[float, float], None]:
-        """Show the bar."""
-        if not on_terminal():
+        """Start the bar and return its callback."""
+        if not is_terminal():
             return self._estimate
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(self.says))
-        self.bar = Progress(*columns, TimeRemainingColumn(), console=errors(), transient=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(self.label))
+        self.bar = Progress(*columns, TimeRemainingColumn(), console=error_console(), transient=True)
         task = self.bar.add_task(self.title, total=1.0)
         self.bar.start()
-        return lambda t, t_end: self.bar.update(task, completed=t, total=t_end)
+        return lambda progress, total: self.bar.update(task, completed=progress, total=total)
 
     def __exit__(self, *_: object) -> None:
-        """Take it away."""
+        """Remove the bar."""
         if self.bar is not None:
             self.bar.stop()
 
-    def _estimate(self, done: float, whole: float) -> None:
-        """Say once how long it will take, by what was done in the first `FIRST_LOOK` of it; preparing is no part."""
-        if self.said or not 0 <= done < whole:
+    def _estimate(self, progress: float, total: float) -> None:
+        """Print the remaining time once, `ESTIMATE_DELAY_S` after the first call. The preparation does not count."""
+        if self.has_estimated or not 0 <= progress < total:
             return
         now = perf_counter()
-        began, at = self.first = self.first or (now, done)
-        if now - began < FIRST_LOOK or done <= at:
+        start, start_progress = self.first_call = self.first_call or (now, progress)
+        if now - start < ESTIMATE_DELAY_S or progress <= start_progress:
             return
-        self.said = True
-        left = (now - began) * (whole - done) / (done - at)
-        if now - began + left > LONG:
-            errors().print(f"{self.title}: about {left:.0f} s more")
+        self.has_estimated = True
+        remaining = (now - start) * (total - progress) / (progress - start_progress)
+        if now - start + remaining > LONG_S:
+            error_console().print(f"{self.title}: about {remaining:.0f} s more")
 
 
-class Working:
-    """A sign on a terminal, from `SOON` on, that something is under way whose end nobody knows; nothing in a pipe."""
+class Spinner:
+    """Spinner for an operation of unknown duration. It appears after `SPINNER_DELAY_S`, and only on a terminal."""
 
     def __init__(self, title: str) -> None:
         self.title = title
-        self.sign: Any = None
+        self.display: Any = None
         self.timer: Timer | None = None
 
     def __enter__(self) -> None:
-        """Wait with it."""
-        if on_terminal():
+        """Start the timer that shows the spinner."""
+        if is_terminal():
             from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
             columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-            self.sign = Progress(*columns, console=errors(), transient=True)
-            self.sign.add_task(self.title)
-            self.timer = Timer(SOON, self.sign.start)
+            self.display = Progress(*columns, console=error_console(), transient=True)
+            self.display.add_task(self.title)
+            self.timer = Timer(SPINNER_DELAY_S, self.display.start)
             self.timer.daemon = True
             self.timer.start()
 
     def __exit__(self, *_: object) -> None:
-        """Take it away."""
+        """Remove the spinner."""
         if self.timer is not None:
             self.timer.cancel()
             self.timer.join()
-            self.sign.stop()
+            self.display.stop()

@@ -1,6 +1,8 @@
-"""SIGINT and SIGTERM in the process of the `ckc` command.
+"""SIGINT and SIGTERM in the process of the `ckc` command, and the exit codes.
 
-This module is imported before everything else of the command, so it imports little itself.
+The exit codes are 0 (done), 2 (the input is wrong, known before the first step), 3 (the numerics stopped), 130 and 143
+(interrupted by SIGINT and SIGTERM). This module is imported before everything else of the command, so it imports
+little itself.
 """
 
 from __future__ import annotations
@@ -14,14 +16,16 @@ from contextlib import contextmanager, suppress
 from time import monotonic
 
 from ckc_pin.base.interrupt import CommandInterrupt
-from ckc_pin.cli.exits import INTERRUPTED, TERMINATED
 
 TYPE_CHECKING = False  # importing `typing` would take longer than the rest of this module
 if TYPE_CHECKING:
     from types import FrameType
     from typing import NoReturn
 
-__all__ = ["Interrupts", "interrupts"]
+__all__ = ["DONE", "INTERRUPTED", "STOPPED", "TERMINATED", "WRONG_INPUT", "Interrupts", "interrupt_code",
+           "interrupts"]  # fmt: skip
+
+DONE, WRONG_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 2, 3, 130, 143  # exit codes
 
 RETRY_PERIOD_S, IMPORT_PATIENCE_S = 0.03, 0.5
 EXIT_PATIENCE_S = 0.5  # for the exit functions after an interrupt: Dask's waits 10 s for a cluster that is half begun
@@ -147,6 +151,11 @@ class Interrupts:
 
 
 interrupts = Interrupts()
+
+
+def interrupt_code(message: str) -> int:
+    """Return the exit code after an interrupt, whose message names the signal if it is SIGTERM."""
+    return TERMINATED if "SIGTERM" in message else INTERRUPTED
 
 
 def _innermost_caller(frame: FrameType | None) -> str:

@@ -114,7 +114,7 @@ def _find_viewer_folder() -> Path:
         viewer = Path(folder) / "viewer"
         if (viewer / "dist" / "main.min.js").is_file():
             return viewer
-    raise InputError("playback needs meshcat, which is not installed; pip install 'ckc_pin[view]'")
+    raise InputError("playback needs meshcat: pip install 'ckc_pin[view]'")
 
 
 def _render(title: str, lines: Sequence[str], scripts: str, head: str = "") -> str:

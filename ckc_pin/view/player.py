@@ -102,9 +102,7 @@ def start_server(title: str, lines: Sequence[str], port: int) -> ViewServer:
     try:
         from ckc_pin.view.server import ViewServer
     except ModuleNotFoundError:
-        raise InputError(
-            "playback needs meshcat and tornado, which are not installed; pip install 'ckc_pin[view]'"
-        ) from None
+        raise InputError("playback needs meshcat and tornado: pip install 'ckc_pin[view]'") from None
     return ViewServer(render_server_page(title, lines), port)
 
 

@@ -92,7 +92,7 @@ def figure_style() -> _GeneratorContextManager[None]:
     try:
         from matplotlib import style
     except ModuleNotFoundError:
-        raise InputError("figures need matplotlib, which is not installed; pip install 'ckc_pin[view]'") from None
+        raise InputError("figures need matplotlib: pip install 'ckc_pin[view]'") from None
     return style.context(["default", RC_PARAMS])
 
 

@@ -185,7 +185,7 @@ def _read_mesh(path: Path, scale: tuple[float, ...]) -> Surface | None:
     try:
         import yourdfpy
     except ModuleNotFoundError:
-        raise InputError("meshes need yourdfpy, which is not installed; pip install 'ckc_pin[view]'") from None
+        raise InputError("meshes need yourdfpy: pip install 'ckc_pin[view]'") from None
     mesh = yourdfpy.Mesh(filename=str(path), scale=np.array(scale))
     link = yourdfpy.Link("link", visuals=[yourdfpy.Visual(geometry=yourdfpy.Geometry(mesh=mesh))])
     robot = yourdfpy.Robot(name="mesh", links=[link])

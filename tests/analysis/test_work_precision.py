@@ -20,7 +20,7 @@ from ckc_pin.analysis.precision.compute import advise_settings
 from ckc_pin.analysis.precision.motion import INSTANTS, Motion, list_settings
 from ckc_pin.analysis.precision.mujoco import load_model
 from ckc_pin.analysis.precision.reference import Reference, find_confirmed_span, find_reference
-from ckc_pin.cli.arguments import read_overrides
+from ckc_pin.cli.options import read_overrides
 from ckc_pin.formats.exporting import export
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.analysis.swing_table import START, pendulum, write_table

@@ -1,4 +1,4 @@
-"""What the commands say of themselves, and how values are read and printed."""
+"""Help texts of commands, and how option values are parsed and printed."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import pytest
 
 from ckc_pin.base.summary import to_json
 from ckc_pin.cli.app import COMMANDS
-from ckc_pin.cli.arguments import read_overrides
+from ckc_pin.cli.options import read_overrides
 from tests.contract.helpers.command import ckc
 
 
-def test_list() -> None:
+def test_list_shows_all_mechanisms_and_scenes() -> None:
     listed = ckc("list", "--json").json["mechanisms"]
     scenes = {entry["name"]: entry["scenes"] for entry in listed}
     assert set(scenes["five_bar"]) >= {"default", "set_point", "swing", "tracking"}
@@ -22,7 +22,7 @@ def test_list() -> None:
         assert all(f"{entry['name']}/{scene}" in plain for scene in entry["scenes"])
 
 
-def test_ckc_alone_says_where_to_begin() -> None:
+def test_ckc_without_command_prints_an_introduction() -> None:
     answer = ckc()
     assert answer.code == 0
     for words in ("Begin with", "ckc list", "ckc run five_bar/tracking", "ckc play"):
@@ -37,7 +37,7 @@ def test_help_of_every_command_has_an_example(name: str) -> None:
     assert f"\n    ckc {name}" in answer.out.partition("Examples:")[2]
 
 
-def test_values_of_settings() -> None:
+def test_settings_are_parsed_as_toml_or_text() -> None:
     read = read_overrides(
         "--set",
         [
@@ -67,24 +67,24 @@ def test_values_of_settings() -> None:
     }
 
 
-def test_later_settings_win_and_reach_into_tables() -> None:
+def test_later_settings_override_earlier_ones() -> None:
     words = ("run", "five_bar/swing", "--json", "--set", "t_end=9.0", "--set", "solver.output_dt=0.1")
-    found = ckc(*words, "--set", "t_end=0.1", "--set", "solver.method=RK45").json
-    assert found["t"] == 0.1
-    assert found["stats"]["method"] == "RK45"
+    result = ckc(*words, "--set", "t_end=0.1", "--set", "solver.method=RK45").json
+    assert result["t"] == 0.1
+    assert result["stats"]["method"] == "RK45"
 
 
-def test_json_knows_no_nan_and_no_infinity() -> None:
+def test_nan_and_infinity_are_null_in_json() -> None:
     assert to_json({"a": math.nan, "b": [math.inf, 1.0], "c": {"d": (-math.inf,)}}) == (
         '{"a": null, "b": [null, 1.0], "c": {"d": [null]}}'
     )
 
 
-def test_a_name_that_no_terminal_can_show_is_no_error() -> None:
+def test_unprintable_names_are_escaped() -> None:
     assert ckc("check", "\udcff.toml", "--json").json["message"].endswith("no such mechanism file")
 
 
-def test_no_summary_of_a_command_is_cut_off():
+def test_short_help_is_not_truncated():
     listed = ckc("--help").out.split("Commands:")[1]
     assert "..." not in listed
     assert "(Fig" not in listed

@@ -1,4 +1,4 @@
-"""The commands as somebody meets them first: a folder of one's own, completion, where results went, what help says."""
+"""First steps with the commands: `ckc new`, completion, where results are saved, help."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import ckc_pin
 from ckc_pin import Run, check, load, simulate
 from ckc_pin.cli import output
 from ckc_pin.cli.app import COMMANDS
-from ckc_pin.cli.output import ProgressBar, Working
+from ckc_pin.cli.output import ProgressBar, Spinner
 from tests.contract.helpers.command import Outcome, ckc
 
-SHORT = ("--set", "t_end=0.01")
+SHORT_RUN = ("--set", "t_end=0.01")
 
 
 def program(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
@@ -29,21 +29,21 @@ def program(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
 # --- how it is called --------------------------------------------------------------------------------
 
 
-def test_version_and_the_package_as_a_program() -> None:
+def test_version_and_python_m_ckc_pin() -> None:
     assert ckc("--version").out == f"ckc {ckc_pin.__version__}\n"
-    found = program("--version")
-    assert (found.returncode, found.stdout) == (0, f"ckc {ckc_pin.__version__}\n")
+    result = program("--version")
+    assert (result.returncode, result.stdout) == (0, f"ckc {ckc_pin.__version__}\n")
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_gets_its_completion(shell: str) -> None:
-    found = program(_CKC_COMPLETE=f"{shell}_source")
-    assert found.returncode == 0
-    assert f"_CKC_COMPLETE={shell}_complete" in found.stdout
+def test_shell_completion_scripts_are_printed(shell: str) -> None:
+    result = program(_CKC_COMPLETE=f"{shell}_source")
+    assert result.returncode == 0
+    assert f"_CKC_COMPLETE={shell}_complete" in result.stdout
 
 
 @pytest.mark.parametrize(
-    ("line", "wanted"),
+    ("line", "expected"),
     [
         ("ckc in", {"plain,inverse"}),
         ("ckc run five_bar/t", {"plain,five_bar/tracking", "file,five_bar/t"}),
@@ -54,11 +54,11 @@ def test_a_shell_gets_its_completion(shell: str) -> None:
         ("ckc play ru", {"file,ru"}),
     ],
 )
-def test_names_are_completed(line: str, wanted: set[str]) -> None:
+def test_shipped_names_are_completed(line: str, expected: set[str]) -> None:
     words = line.split()
-    found = program(_CKC_COMPLETE="bash_complete", COMP_WORDS=line, COMP_CWORD=str(len(words) - 1))
-    assert found.returncode == 0
-    assert set(found.stdout.splitlines()) >= wanted
+    result = program(_CKC_COMPLETE="bash_complete", COMP_WORDS=line, COMP_CWORD=str(len(words) - 1))
+    assert result.returncode == 0
+    assert set(result.stdout.splitlines()) >= expected
 
 
 # --- a folder of one's own ---------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "mine"
 
 
-def test_a_new_folder_runs_where_it_is(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_folder_can_be_run_from_inside(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mine)
     answer = ckc("run", ".", "--out", "first")
     assert (answer.code, answer.err) == (0, "")
@@ -85,12 +85,12 @@ def test_a_new_folder_runs_where_it_is(mine: Path, monkeypatch: pytest.MonkeyPat
     assert run.mechanism.name == "mine"
     assert np.ptp(run["shoulder"]) > 1.0, "it moves"
     assert np.abs(run.energy - run.energy[0]).max() < 1e-6
-    found = check(mine)
-    assert (found.n, found.d, found.warnings) == (3, 1, ())
+    result = check(mine)
+    assert (result.n, result.d, result.warnings) == (3, 1, ())
     assert ckc("check", ".").code == 0
 
 
-def test_a_new_folders_loop_is_closed_as_by_hand(mine: Path) -> None:
+def test_new_mechanism_agrees_with_closed_form_assembly(mine: Path) -> None:
     """Rod and rocker meet: two circles, of 0.6 m about the crank's end and of 0.4 m about the hip."""
     run = simulate(mine)
     crank = 0.2 * np.stack([np.cos(run["shoulder"]), np.sin(run["shoulder"])], axis=1)
@@ -102,7 +102,7 @@ def test_a_new_folders_loop_is_closed_as_by_hand(mine: Path) -> None:
     assert np.abs(knee - rocker).max() < 1e-9
 
 
-def test_what_a_new_folder_leaves_out_by_comments_works(mine: Path) -> None:
+def test_commented_lines_of_new_files_are_valid(mine: Path) -> None:
     path = mine / "default.scene.toml"
     text = path.read_text(encoding="utf-8")
     head, mark, rest = text.partition("# [controller]")
@@ -112,7 +112,7 @@ def test_what_a_new_folder_leaves_out_by_comments_works(mine: Path) -> None:
     assert run["shoulder"][-1] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
+def test_new_replaces_no_file(mine: Path, tmp_path: Path) -> None:
     answer = ckc("new", "mine", "--json")
     assert answer.code == 2
     assert "is there already; give another name" in answer.json["message"]
@@ -141,23 +141,21 @@ def test_a_new_folder_replaces_nothing(mine: Path, tmp_path: Path) -> None:
         (["import", ""], "FILE"),
     ],
 )
-def test_an_empty_path_is_not_the_current_folder(
-    words: list[str], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_empty_path_is_rejected(words: list[str], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     answer = ckc(*words)
     assert (answer.code, answer.err) == (2, f"error: {what} is empty; give a name\n")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_page_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_html_and_gif_paths_must_not_be_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     simulate("five_bar/swing", {"t_end": 0.01}).save("o")
     answer = ckc("play", "o", "--html", ".")
     assert (answer.code, answer.err) == (2, "error: .: expected the name of a file, got a folder\n")
 
 
-def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> None:
+def test_start_by_dependent_coordinates_names_the_independent_ones(mine: Path) -> None:
     mechanism = mine / "mechanism.toml"
     mechanism.write_text(mechanism.read_text().replace("independent =", "# independent ="))
     (chosen,) = check(mechanism).independent
@@ -171,28 +169,28 @@ def test_a_start_by_other_coordinates_than_were_chosen_says_so(mine: Path) -> No
     assert "because mine/mechanism.toml has no key independent; set independent = [...] there" in answer.err
 
 
-def test_what_comes_next_can_be_typed_as_it_stands(tmp_path: Path) -> None:
+def test_suggested_next_command_is_quoted(tmp_path: Path) -> None:
     (tmp_path / "my robots").mkdir()
     answer = ckc("new", str(tmp_path / "my robots" / "arm"))
     assert answer.out.splitlines()[-1] == f"next: cd '{tmp_path}/my robots/arm' && ckc run ."
 
 
-def test_a_new_folder_that_cannot_be_is_refused_by_its_name(tmp_path: Path) -> None:
+def test_unwritable_new_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     answer = ckc("new", str(tmp_path / "file" / "mine"))
     assert answer.code == 2
     assert answer.err == f"error: {tmp_path / 'file' / 'mine'}: no folder that can be written to: Not a directory\n"
 
 
-def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_without_default_scene_lists_its_scenes(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mine)
     Path("default.scene.toml").rename("drop.scene.toml")
-    assert ckc("run", ".", *SHORT).out.startswith("Run of mine/drop, done")
+    assert ckc("run", ".", *SHORT_RUN).out.startswith("Run of mine/drop, done")
     for word in ("drop", "drop.scene.toml"):
-        assert ckc("run", word, *SHORT).out.startswith(f"Run of {word}, done")
+        assert ckc("run", word, *SHORT_RUN).out.startswith(f"Run of {word}, done")
         assert ckc("check", word).code == 0
     monkeypatch.chdir(mine.parent)
-    assert ckc("run", "mine/drop", *SHORT).code == 0
+    assert ckc("run", "mine/drop", *SHORT_RUN).code == 0
     other = mine / "other.scene.toml"
     other.write_text((mine / "drop.scene.toml").read_text(encoding="utf-8"), encoding="utf-8")
     both = ckc("run", "mine")
@@ -207,14 +205,14 @@ def test_own_scenes_need_no_default(mine: Path, monkeypatch: pytest.MonkeyPatch)
     assert "mine: a finished run, not a scene; ckc play, plot and inverse accept this folder" in ckc("run", "mine").err
 
 
-# --- what is drawn, what is kept ---------------------------------------------------------------------
+# --- what is drawn, results that are saved ---------------------------------------------------------------------
 
 
-def test_figures_are_drawn_when_they_are_asked_for(tmp_path: Path) -> None:
+def test_figures_option_draws_figures(tmp_path: Path) -> None:
     plain, drawn = tmp_path / "plain", tmp_path / "drawn"
-    assert ckc("run", "five_bar/swing", *SHORT, "--out", str(plain)).code == 0
+    assert ckc("run", "five_bar/swing", *SHORT_RUN, "--out", str(plain)).code == 0
     assert sorted(path.name for path in plain.iterdir()) == ["run.npz", "scene.json"]
-    assert ckc("run", "five_bar/swing", *SHORT, "--out", str(drawn), "--figures").code == 0
+    assert ckc("run", "five_bar/swing", *SHORT_RUN, "--out", str(drawn), "--figures").code == 0
     names = {path.name for path in drawn.iterdir()}
     assert names == {"run.npz", "scene.json", "motion.png", "motion_snapshots.png"}
     forces = tmp_path / "forces"
@@ -227,12 +225,12 @@ def test_figures_are_drawn_when_they_are_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("run", "five_bar/swing", *SHORT), "not saved: --out DIR keeps the run, for ckc play, plot and inverse"),
-        (("inverse", "five_bar/set_point", *SHORT), "not saved: --out DIR keeps inverse.npz, for other programs"),
+        (("run", "five_bar/swing", *SHORT_RUN), "not saved: --out DIR keeps the run, for ckc play, plot and inverse"),
+        (("inverse", "five_bar/set_point", *SHORT_RUN), "not saved: --out DIR keeps inverse.npz, for other programs"),
         (("map", "four_bar", "--cells", "16"), "not drawn: --out DIR draws the map there"),
     ],
 )
-def test_without_a_folder_it_says_where_results_would_go(words: tuple[str, ...], says: str) -> None:
+def test_commands_without_out_say_how_to_save(words: tuple[str, ...], says: str) -> None:
     answer = ckc(*words)
     assert answer.code == 0
     assert answer.out.splitlines()[-1] == says
@@ -248,11 +246,11 @@ def _warned(answer: Outcome) -> list[str]:
     return [line for line in (answer.out + answer.err).splitlines() if "warning" in line and "0 warnings" not in line]
 
 
-def test_a_warning_is_said_once_and_where_it_matters() -> None:
+def test_warnings_are_printed_once() -> None:
     about_limits = "joint limits are not stops"
     assert any(about_limits in warning for warning in check("talos").warnings)
-    assert _warned(ckc("run", "talos", *SHORT)) == []
-    assert _warned(ckc("run", "five_bar_as_printed/tracking", *SHORT)) == [], "so short it stays inside"
+    assert _warned(ckc("run", "talos", *SHORT_RUN)) == []
+    assert _warned(ckc("run", "five_bar_as_printed/tracking", *SHORT_RUN)) == [], "so short it stays inside"
     spoilt = ckc("run", "five_bar_as_printed/tracking", "--set", "formulation=reduced")
     assert len(_warned(spoilt)) == 1
     assert "leaves the workspace at t = 4.393" in spoilt.err
@@ -263,7 +261,7 @@ def test_a_warning_is_said_once_and_where_it_matters() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_values_are_named_in_one_style(name: str) -> None:
+def test_placeholders_in_help_have_one_style(name: str) -> None:
     said = ckc(name, "--help").out
     shown = re.findall(r"^  (?:-h, )?(--\S+)(?: (\S+))?  ", said, re.MULTILINE)
     assert ("--help", "") in shown
@@ -274,38 +272,39 @@ def test_values_are_named_in_one_style(name: str) -> None:
             assert value == "DIR"
 
 
-def test_values_that_cannot_be_are_refused_with_the_choices() -> None:
+def test_invalid_choices_are_rejected_with_the_valid_ones() -> None:
     assert "'joint', 'cartesian'" in ckc("map", "five_bar", "--space", "outer").err
     assert "'mjcf'" in ckc("export", "five_bar", "--to", "sdf").err
 
 
-def test_a_sign_of_work_is_for_terminals_and_only_for_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Working("nothing") as sign:
-        assert sign is None
-    monkeypatch.setattr(output, "on_terminal", lambda: True)
-    quick = Working("quick")
+def test_spinner_appears_on_terminals_after_a_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    piped = Spinner("piped")
+    with piped:
+        assert piped.display is None
+    monkeypatch.setattr(output, "is_terminal", lambda: True)
+    quick = Spinner("quick")
     with quick:
-        assert not quick.sign.live.is_started
-    assert not quick.sign.live.is_started
-    monkeypatch.setattr(output, "SOON", 0.0)
-    slow = Working("slow")
+        assert not quick.display.live.is_started
+    assert not quick.display.live.is_started
+    monkeypatch.setattr(output, "SPINNER_DELAY_S", 0.0)
+    slow = Spinner("slow")
     with slow:
         slow.timer.join()
-        assert slow.sign.live.is_started
-    assert not slow.sign.live.is_started
+        assert slow.display.live.is_started
+    assert not slow.display.live.is_started
 
 
-@pytest.mark.parametrize(("share", "says"), [(0.1, ["the run: about 27 s more"]), (0.5, [])])
-def test_in_a_pipe_what_takes_long_is_estimated_once(
-    share: float, says: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("share", "lines"), [(0.1, ["the run: about 27 s more"]), (0.5, [])])
+def test_remaining_time_of_a_long_command_is_printed_once_in_a_pipe(
+    share: float, lines: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Three seconds for a tenth are thirty in all; for half they are six, which need no words. Preparing is no part."""
+    """A tenth in three seconds makes 30 s in total, which is printed; half makes 6 s. Preparation is not counted."""
     clock = [100.0]
     monkeypatch.setattr(output, "perf_counter", lambda: clock[0])
-    output.errors.cache_clear()
+    output.error_console.cache_clear()
     with ProgressBar("the run") as progress:
         for second, part in ((60.0, 0.0), (61.0, 0.01), (63.0, share), (64.0, share + 0.01), (65.0, share + 0.02)):
             clock[0] = 100.0 + second
             progress(2.0 * part, 2.0)
-    assert capsys.readouterr().err.splitlines() == says
-    output.errors.cache_clear()
+    assert capsys.readouterr().err.splitlines() == lines
+    output.error_console.cache_clear()

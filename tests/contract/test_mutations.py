@@ -18,7 +18,7 @@ from ckc_pin import CkcError, Run, check, load, simulate
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import to_json
 from ckc_pin.base.toml import convert, join_dotted_keys
-from ckc_pin.cli.tables import profile_table
+from ckc_pin.cli.runs import format_profile
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.library import library
 from ckc_pin.mechanism.spec import MechanismSpec
@@ -141,4 +141,4 @@ def test_run_files(tmp_path: Path) -> None:
 
 def _read(path: Path) -> None:
     run = Run.load(path)
-    to_json(run.to_dict()), run.summary().text(), profile_table(run), run.loop_forces(), run.points
+    to_json(run.to_dict()), run.summary().text(), format_profile(run), run.loop_forces(), run.points

@@ -1,0 +1,119 @@
+"""Commands that create mechanism files: new, import; and export to other programs' formats."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from shlex import quote
+
+import click
+
+import ckc_pin
+from ckc_pin.base.atomic_files import write_atomic
+from ckc_pin.cli import options
+from ckc_pin.cli.output import Spinner, error_console, make_folder, print_json, print_summary, print_written
+from ckc_pin.cli.signals import interrupts
+from ckc_pin.errors import InputError
+
+__all__ = ["export", "import_", "new"]
+
+TEMPLATES = Path(__file__).parent / "new_files"  # "NAME" in their names and texts is replaced by the mechanism's name
+VALID_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+@click.command(epilog=options.format_examples("ckc new mine", "cd mine", "ckc run . --out first", "ckc play first"))
+@click.argument("folder", metavar="NAME", type=options.PATH, help="Name of the mechanism and its new folder.")
+@options.as_json
+def new(folder: Path, as_json: bool) -> None:
+    """Create a folder with a mechanism of one loop. Its three files can be run and have comments; edit them."""
+    name = folder.resolve().name if folder.name in ("", ".", "..") else folder.name
+    if not VALID_NAME.fullmatch(name):
+        raise InputError(
+            f"{name!r}: a name consists of letters, digits, - and _, and begins with a letter or a digit; give another"
+        )
+    templates = sorted(TEMPLATES.iterdir())
+    paths = [folder / path.name.replace("NAME", name) for path in templates]
+    existing = [path for path in (folder, *paths) if os.path.exists(path)]
+    if os.path.isdir(folder):
+        existing.remove(folder)
+    if existing:
+        raise InputError(f"{existing[0]}: is there already; give another name")
+    with interrupts.deferred():  # all files or none
+        make_folder(folder, "")
+        for path, template in zip(paths, templates, strict=True):
+            write_atomic(path, template.read_text(encoding="utf-8").replace("NAME", name))
+    if as_json:
+        print_json({"status": "done", "written": [str(path) for path in paths]})
+        return
+    print_written(paths)
+    print(f"next: cd {quote(str(folder))} && ckc run .")
+
+
+@click.command("import", epilog=options.format_examples("ckc import cassie.xml --out mechanisms/cassie"))
+@click.argument(
+    "file",
+    metavar="FILE",
+    type=options.PATH,
+    help="An MJCF of MuJoCo, a URDF, or a robot.yaml next to its URDF.",
+)
+@options.out(help="Folder to write to; default: the robot's name.")
+@options.overwrite
+@options.as_json
+def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> None:
+    """Convert a robot from another format. Writes mechanism.toml and a URDF, and lists guesses and omissions."""
+    from ckc_pin.formats import importing
+
+    # MuJoCo imports GLFW for its windows. GLFW starts a Python process, which prints a traceback on Ctrl-C.
+    os.environ.setdefault("MUJOCO_GL", "disable")
+    with Spinner(f"reading {file.name}"):
+        draft = importing.read(file)
+    with interrupts.deferred():  # both files or none
+        paths = importing.write(draft, out or Path(draft.name), overwrite)
+    result, problem = None, ""
+    try:
+        result = ckc_pin.check(paths[0])
+    except ckc_pin.MechanismError as error:  # The files remain, so that the user can correct them.
+        problem = str(error)
+    if as_json:
+        notes = {"left_out": draft.left_out, "guessed": draft.guessed}
+        check = {"status": "done", **result.to_dict()} if result else {"status": "error", "message": problem}
+        print_json({"status": "done", "written": [str(path) for path in paths], **notes, "check": check})
+        return
+    for label, items in (("written", paths), ("guessed", draft.guessed), ("left out", draft.left_out)):
+        for item in items:
+            print(f"{label}: {item}")
+    if result:
+        print_summary(result.summary())
+    else:
+        print(f"check: {problem}")
+
+
+@click.command(
+    epilog=options.format_examples(
+        "ckc export five_bar --to mjcf > five_bar.xml", "ckc export mine --to mjcf --out models"
+    )
+)
+@options.mechanism
+@click.option("--to", type=click.Choice(["mjcf"]), default="mjcf", help="mjcf: a model of MuJoCo.")
+@options.out(help="Folder to write to; without it the model is printed.")
+@options.overwrite
+@options.as_json
+def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: bool) -> None:
+    """Convert a mechanism for another program. Lists how its motion differs there."""
+    from ckc_pin.formats import exporting
+
+    with Spinner(f"export of {mechanism}"):
+        exported = exporting.export(ckc_pin.load(mechanism), to)
+    paths = [] if out is None else [exporting.write(exported, out, overwrite)]
+    if as_json:
+        text = {} if paths else {"text": exported.text}
+        written = [str(path) for path in paths]
+        print_json({"status": "done", "written": written, **text, "differs": exported.differences})
+        return
+    if paths:
+        print_written(paths)
+    else:
+        print(exported.text)
+    for difference in exported.differences:
+        (print if paths else error_console().print)(f"differs: {difference}")
