@@ -1,4 +1,4 @@
-"""Pages in a headless Chromium, and everything they did that a page must not do."""
+"""Pages in a headless Chromium, with their errors and requests."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from playwright.sync_api import Browser, Page, sync_playwright
 __all__ = ["Visit", "browser", "look_at"]
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "/Applications/Chromium.app/Contents/MacOS/Chromium")
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a graphics card
+SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a GPU
 SANDBOX = [] if os.getuid() else ["--no-sandbox"]  # Chromium's own does not run as root
 PATIENCE = 60.0  # s
 
 # Objects of meshcat's tree by path, their placements in the axes of /world, and what is seen of them.
 TREE = """() => {
-  const found = {};
+  const objects = {};
   viewer.scene.updateMatrixWorld(true);
   const world = viewer.scene_tree.find(["world"]).object.matrixWorld.clone().invert();
   (function walk(node, path) {
     for (const [name, child] of Object.entries(node.children)) {
       const one = child.object, here = path + "/" + name;
-      found[here] = {
+      objects[here] = {
         type: one.type, visible: one.visible,
         matrix: world.clone().multiply(one.matrixWorld).elements,
         opacity: one.material ? one.material.opacity : null,
@@ -38,7 +38,7 @@ TREE = """() => {
       walk(child, here);
     }
   })(viewer.scene_tree, "");
-  return found;
+  return objects;
 }"""
 
 # Moves the time slider and says where objects are then.
@@ -79,8 +79,8 @@ class Visit:
 
     def tree(self) -> dict[str, dict[str, Any]]:
         """Objects by path."""
-        found: dict[str, dict[str, Any]] = self.page.evaluate(TREE)
-        return found
+        objects: dict[str, dict[str, Any]] = self.page.evaluate(TREE)
+        return objects
 
     def placements(self, times: np.ndarray, paths: list[str]) -> np.ndarray:
         """Placements (times, paths, 4, 4) in the axes of /world."""
@@ -115,7 +115,7 @@ def look_at(browser: Browser) -> Iterator[Callable[..., Visit]]:
             assert visit.complaints == []
             visit.page.context.close()
 
-    def look(url: str, until: str = "viewer.animator.actions.length", offline: bool = False) -> Visit:
+    def open_page(url: str, until: str = "viewer.animator.actions.length", offline: bool = False) -> Visit:
         context = browser.new_context(viewport={"width": 960, "height": 540}, offline=offline)
         visits.append(Visit(context.new_page()))
         visits[-1].page.goto(url)
@@ -123,4 +123,4 @@ def look_at(browser: Browser) -> Iterator[Callable[..., Visit]]:
         return visits[-1]
 
     with closing():
-        yield look
+        yield open_page

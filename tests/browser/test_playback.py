@@ -1,4 +1,4 @@
-"""Playback as a person has it: in a browser, live and from a file."""
+"""Playback in a browser: from the server, live and from a file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def assert_elbows(visit, run: ckc_pin.Run, root: str) -> None:
         np.testing.assert_allclose(placed[:, k, :3, 3], elbow(run, joint), atol=1e-6)
 
 
-def test_the_live_page_plays_the_run(look_at, tracking):
+def test_server_page_plays_the_run(look_at, tracking):
     with play_runs(tracking, block=False) as server:
         visit = look_at(server.url)
         tree = visit.tree()
@@ -55,11 +55,16 @@ def test_the_live_page_plays_the_run(look_at, tracking):
         assert tree[f"{root}/trace:tip/<object>"]["corners"] == len(tracking.t)
         assert visit.caption() == ["five_bar/tracking", "reduced", "gray: desired"]
         assert_elbows(visit, tracking, "1: reduced")
-        own = server.url.removeprefix("http")
-        assert set(visit.requests) == {f"http{own}", f"http{own}main.min.js", f"http{own}start.js", f"ws{own}"}
+        address = server.url.removeprefix("http")
+        assert set(visit.requests) == {
+            f"http{address}",
+            f"http{address}main.min.js",
+            f"http{address}start.js",
+            f"ws{address}",
+        }
 
 
-def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracking):
+def test_playback_starts_at_the_given_speed_with_a_time_slider(look_at, tracking):
     with play_runs(tracking, speed=0.5, block=False) as server:
         visit = look_at(server.url)
         assert visit.page.evaluate("viewer.animator.mixer.timeScale") == 0.5
@@ -79,7 +84,7 @@ def test_it_plays_by_itself_at_the_speed_asked_for_with_a_slider(look_at, tracki
         assert visit.page.evaluate("viewer.animator.duration") == pytest.approx(9.5)
 
 
-def test_what_is_seen_is_the_mechanism(look_at, tracking):
+def test_screenshot_shows_the_links(look_at, tracking):
     with play_runs(tracking, block=False) as server:
         visit = look_at(server.url)
         visit.placements(np.array([1.5]), ["/world"])
@@ -91,7 +96,7 @@ def test_what_is_seen_is_the_mechanism(look_at, tracking):
     assert np.median(image) > 0.85  # on a bright ground
 
 
-def test_the_file_plays_from_disk_without_a_network(look_at, tracking, tmp_path):
+def test_saved_page_plays_from_disk_without_network(look_at, tracking, tmp_path):
     path = save_html(tracking, tmp_path / "tracking.html")
     visit = look_at(path.as_uri(), offline=True)
     assert visit.requests == [path.as_uri()]
@@ -99,11 +104,11 @@ def test_the_file_plays_from_disk_without_a_network(look_at, tracking, tmp_path)
     assert_elbows(visit, tracking, "1: reduced")
 
 
-def test_a_notebook_shows_it_in_a_frame_that_can_reach_nothing(look_at, tracking, tmp_path):
-    """The cell's own markup in a page of its own: the frame plays, and its scripts have no part in that page."""
+def test_notebook_frame_is_isolated_from_its_page(look_at, tracking, tmp_path):
+    """The cell's markup in a test page: the frame plays, and its scripts cannot access that page."""
     page = tmp_path / "cell.html"
-    shown = tracking.play(inline=True)._repr_html_()
-    cell = f"<!DOCTYPE html><title>cell</title><script>viewer = 'none here'</script><body>{shown}</body>"
+    displayed = tracking.play(inline=True)._repr_html_()
+    cell = f"<!DOCTYPE html><title>cell</title><script>viewer = 'none here'</script><body>{displayed}</body>"
     page.write_text(cell, encoding="utf-8")
     visit = look_at(page.as_uri(), "document.querySelector('iframe')", offline=True)
     (frame,) = visit.page.main_frame.child_frames
@@ -116,7 +121,7 @@ def test_a_notebook_shows_it_in_a_frame_that_can_reach_nothing(look_at, tracking
     assert not [url for url in visit.requests if url.startswith(("http", "ws"))]
 
 
-def test_two_runs_meshes_and_gaps(look_at, run, tmp_path):
+def test_saved_page_draws_two_runs_with_meshes_and_gaps(look_at, run, tmp_path):
     mesh = '<visual><geometry><mesh filename="crank.stl"/></geometry></visual>'
     urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{mesh}')
     scene = write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, START_OF_FOUR_BAR, 0.1)
@@ -137,7 +142,7 @@ def test_two_runs_meshes_and_gaps(look_at, run, tmp_path):
         assert len(colours) == 3  # one a link
 
 
-def test_names_from_files_are_only_text(look_at, tmp_path):
+def test_names_from_files_are_not_parsed_as_html(look_at, tmp_path):
     urdf = FOUR_BAR.replace('"alpha"', f'"{HOSTILE}"').replace('"crank"', f'"{HOSTILE}"')
     loop = FOUR_BAR_LOOP.replace('"alpha"', f"'{PWNED}'").replace("alpha =", f"'{PWNED}' =")
     loop = loop.replace('name = "joint"', f"name = '{PWNED}'")
@@ -154,20 +159,20 @@ def test_names_from_files_are_only_text(look_at, tmp_path):
             assert not [url for url in visit.requests if url.endswith("/x")]
 
 
-def test_a_simulation_is_seen_while_it_computes_and_played_back_after(look_at):
+def test_live_view_shows_the_simulation_then_its_playback(look_at):
     scene = ckc_pin.load_scene("five_bar/swing")
     with live_view(scene, None) as view:
         visit = look_at(view.server.url, until="viewer.scene_tree.children.world?.children.live")
-        shown = []
+        displayed = []
 
         def on_output(t: float, q_tree: np.ndarray) -> None:
             view.on_output(t, q_tree)
             if t in (0.4, 1.2):
                 visit.until(f"document.getElementById('status').textContent === 't = {t:.2f} of 2 s'")
-                shown.append(np.array(visit.tree()["/world/live/joint:theta_2"]["matrix"][12:15]))
+                displayed.append(np.array(visit.tree()["/world/live/joint:theta_2"]["matrix"][12:15]))
 
         run = ckc_pin.simulate(scene, {}, on_output=on_output)
-        for t, where in zip((0.4, 1.2), shown, strict=True):
+        for t, where in zip((0.4, 1.2), displayed, strict=True):
             np.testing.assert_allclose(where, elbow(run, "theta_1")[run.at(t)], atol=1e-6)
         view.stop()
         view.play_back(run)

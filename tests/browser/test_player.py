@@ -1,4 +1,4 @@
-"""The player's buttons and keys, as a person uses them."""
+"""Buttons and keys of the playback page."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def visit(look_at, runs, tmp_path):
     short = replace(
         runs[1], status="stopped", message="phi_z is <singular>", **{n: getattr(runs[1], n)[rows] for n in names}
     )
-    found = look_at(save_html([runs[0], short], tmp_path / "two.html", forces=True).as_uri(), offline=True)
-    found.page.evaluate("player.pause(); player.seek(0)")
-    return found
+    opened = look_at(save_html([runs[0], short], tmp_path / "two.html", forces=True).as_uri(), offline=True)
+    opened.page.evaluate("player.pause(); player.seek(0)")
+    return opened
 
 
 def time(visit) -> float:
@@ -45,7 +45,7 @@ def playing(visit) -> bool:
     return bool(visit.page.evaluate("viewer.animator.playing"))
 
 
-def test_space_plays_and_pauses(visit):
+def test_space_key_plays_and_pauses(visit):
     visit.page.keyboard.press("Space")
     visit.until("viewer.animator.time > 0.05")
     assert playing(visit)
@@ -58,7 +58,7 @@ def test_space_plays_and_pauses(visit):
     assert not playing(visit)
 
 
-def test_arrows_step_and_change_the_speed(visit, runs):
+def test_arrow_keys_step_and_change_the_speed(visit, runs):
     camera = visit.page.evaluate("viewer.camera.position.toArray()")
     visit.page.keyboard.press("ArrowRight")
     assert time(visit) == pytest.approx(END / 100)
@@ -83,7 +83,7 @@ def test_arrows_step_and_change_the_speed(visit, runs):
     assert visit.page.evaluate("viewer.camera.position.toArray()") == camera  # the viewer would pan by arrows
 
 
-def test_it_ends_or_begins_again(visit):
+def test_playback_ends_or_repeats(visit):
     visit.page.evaluate(f"player.seek({END} - 0.1); player.play()")
     visit.until("!viewer.animator.playing")
     assert time(visit) == pytest.approx(END)
@@ -95,7 +95,7 @@ def test_it_ends_or_begins_again(visit):
     visit.until("viewer.animator.playing && viewer.animator.time > 0.05 && viewer.animator.time < 5")
 
 
-def test_runs_are_shown_and_hidden_by_name(visit):
+def test_checkboxes_and_number_keys_show_and_hide_runs(visit):
     assert visit.tree()[SECOND]["visible"]
     visit.page.get_by_label("translucent: SPF").uncheck()
     assert [visit.tree()[path]["visible"] for path in (FIRST, SECOND)] == [True, False]
@@ -105,7 +105,7 @@ def test_runs_are_shown_and_hidden_by_name(visit):
     assert visit.page.get_by_label("translucent: SPF").is_checked()
 
 
-def test_a_stopped_run_says_why_from_its_end_on(visit):
+def test_caption_shows_the_outcome_after_a_run_has_stopped(visit):
     line = "translucent: SPF, ε = 10⁻⁴"
     assert line in visit.caption()
     visit.page.evaluate("player.seek(3.9)")
@@ -115,7 +115,7 @@ def test_a_stopped_run_says_why_from_its_end_on(visit):
     assert "reduced" in visit.caption()
 
 
-def test_arrows_are_the_forces(visit, runs):
+def test_arrows_have_position_direction_and_ratio_of_forces(visit, runs):
     names = [path for path in visit.tree() if path.startswith(f"{FIRST}/forces/") and path.count("/") == 4]
     assert sorted(path.split("/")[-1] for path in names) == ["loop:elbow", "motor:theta_1", "motor:theta_3"]
     times = np.array([1.0, 2.0, 5.0])
@@ -139,7 +139,7 @@ def test_arrows_are_the_forces(visit, runs):
     assert visit.tree()[f"{FIRST}/forces"]["visible"]
 
 
-def test_everything_is_on_a_small_screen(visit):
+def test_all_controls_fit_a_small_screen(visit):
     visit.page.set_viewport_size({"width": 360, "height": 640})
     for name in ("play", "time-slider", "time", "speed", "loop", "forces", "record"):
         box = visit.page.locator(f"#{name}").bounding_box()
@@ -150,7 +150,7 @@ def test_everything_is_on_a_small_screen(visit):
     assert visit.page.evaluate("document.documentElement.scrollWidth") == 360
 
 
-def test_a_video_of_it(visit, tmp_path):
+def test_video_is_recorded_as_webm(visit, tmp_path):
     visit.page.evaluate("viewer.animator.mixer.timeScale = 4")
     with visit.page.expect_download(timeout=60_000) as waiting:
         visit.page.keyboard.press("r")
@@ -160,7 +160,7 @@ def test_a_video_of_it(visit, tmp_path):
     assert (tmp_path / "video.webm").stat().st_size > 10_000
 
 
-def test_the_ends_of_a_loop_lie_on_each_other_in_one_order(visit):
+def test_loop_frames_have_distinct_render_orders(visit):
     orders = visit.page.evaluate(
         """() => ["joint:theta_2/loop:elbow:A", "joint:theta_4/loop:elbow:B"].map(path =>
              viewer.scene_tree.find(["world", "1: reduced", ...path.split("/"), "<object>"]).object.renderOrder)"""

@@ -1,4 +1,4 @@
-"""Wrong names, options and settings on the command line: exit 2 and one message that says what would be right."""
+"""Invalid names, options and settings on the command line: exit code 2 and one message with the valid choices."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ TERMS = ("terms", "five_bar", "--q")
 EMPTY = {"empty/readme.txt": ""}
 
 
-def _set(*changes: str) -> tuple[str, ...]:
-    return ("run", "bar/swing.scene.toml", *(word for change in changes for word in ("--set", change)))
+def _set(*overrides: str) -> tuple[str, ...]:
+    return ("run", "bar/swing.scene.toml", *(word for override in overrides for word in ("--set", override)))
 
 
 CASES = [
@@ -123,5 +123,5 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
-def test_bad_command(case: Bad, bar: Path) -> None:
+def test_invalid_command_lines_are_rejected(case: Bad, bar: Path) -> None:
     expect(case, bar)

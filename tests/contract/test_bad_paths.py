@@ -1,4 +1,4 @@
-"""Paths that no file system takes: one InputError wherever a path is taken, in Python and on the command line."""
+"""Invalid paths raise one InputError, in Python and on the command line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from tests.contract.helpers.command import ckc
 
 SWING = "five_bar/swing"
 BAD_PATHS = ["a" * 5000, f"{'a' * 300}/b", "a\0b", "a\ud800b"]
-SHORT: dict[str, Any] = {"t_end": 0.01, "solver.terms": "pinocchio"}
-SWEEP: dict[str, Any] = {"outputs": {"e": "energy"}, "overrides": SHORT, "progress": False}
+SHORT_RUN: dict[str, Any] = {"t_end": 0.01, "solver.terms": "pinocchio"}
+SWEEP: dict[str, Any] = {"outputs": {"e": "energy"}, "overrides": SHORT_RUN, "progress": False}
 
 
 @pytest.fixture(scope="module")
 def run() -> ckc_pin.Run:
-    return ckc_pin.simulate(SWING, SHORT)
+    return ckc_pin.simulate(SWING, SHORT_RUN)
 
 
 CALLS: dict[str, Callable[[ckc_pin.Run, str], Any]] = {
@@ -65,7 +65,7 @@ def test_bad_paths_are_input_errors(
         ("new",),
     ],
 )
-def test_bad_paths_are_refused_on_the_command_line(
+def test_bad_paths_are_rejected_on_the_command_line(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM at any moment of a command: its exit code says so, and no file is left half-written."""
+"""SIGINT and SIGTERM at any moment of a command: its exit code is right and no file is half-written."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def test_an_interrupted_run_is_printed_and_saved(number: signal.Signals, code: i
         process.send_signal(number)
         out, err = process.communicate(timeout=60)
     assert process.returncode == code
-    found = json.loads(out)
-    assert found["status"] == "interrupted"
-    assert says in found["message"]
-    assert err == f"{found['message']}\n"
-    assert found["t"] >= 0.5, "the output instants before the step that was told"
+    result = json.loads(out)
+    assert result["status"] == "interrupted"
+    assert says in result["message"]
+    assert err == f"{result['message']}\n"
+    assert result["t"] >= 0.5, "the output instants before the step that was told"
     run = ckc_pin.Run.load(tmp_path)
     assert run.status == "interrupted"
-    assert run.t[-1] == found["t"]
-    assert run.q_tree[-1].tolist() == found["q_tree"]
+    assert run.t[-1] == result["t"]
+    assert run.q_tree[-1].tolist() == result["q_tree"]
     assert json.loads((tmp_path / "scene.json").read_text(encoding="utf-8"))["t_end"] == 9000.0
 
 
@@ -142,7 +142,7 @@ def _require_nothing_half_written(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_can_be_interrupted_at_any_call(name: str, tmp_path: Path) -> None:
+def test_command_can_be_interrupted_at_any_call(name: str, tmp_path: Path) -> None:
     code, says = _signalled(tmp_path / "whole", COMMANDS[name], signal.SIGINT, 0)
     assert code == 0, says
     count = int(says.split()[-1])
@@ -228,7 +228,7 @@ ckc_pin.cli.main()
 
 
 @pytest.mark.parametrize("name", SWALLOWED)
-def test_an_interrupt_that_a_library_swallows_is_not_lost(name: str) -> None:
+def test_interrupt_that_a_library_swallows_is_raised_again(name: str) -> None:
     with under_way(SWALLOWS.format(clause=SWALLOWED[name]), "list", "--json") as process:
         out, err = process.communicate(timeout=50)
     assert (process.returncode, err) == (143, "interrupted: by SIGTERM\n")
@@ -255,7 +255,7 @@ done = True
 """
 
 
-def test_an_import_is_not_interrupted_half_way(tmp_path: Path) -> None:
+def test_imports_are_not_interrupted(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(SLOW)
     with under_way(f"import sys; sys.path.append({str(tmp_path)!r})" + IMPORTS, "list") as process:
         out, err = process.communicate(timeout=50)
@@ -271,7 +271,7 @@ ckc_pin.cli.main()
 """
 
 
-def test_a_signal_during_exit_is_not_lost() -> None:
+def test_signal_during_exit_is_not_lost() -> None:
     with under_way(AT_EXIT, "list", "--json") as process:
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "interrupted: by Ctrl-C\n")
@@ -290,7 +290,7 @@ assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, s
     assert (process.returncode, err) == (0, "")
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
+def test_closed_standard_output_is_no_error() -> None:
     """`ckc list | true`, with a pipe that is closed before anything is written."""
     reading, writing = os.pipe()
     os.close(reading)
@@ -321,7 +321,7 @@ ckc_pin.cli.main()
 """
 
 
-def test_import_starts_no_process_that_ctrl_c_would_reach(tmp_path: Path) -> None:
+def test_mujoco_import_starts_no_process(tmp_path: Path) -> None:
     (tmp_path / "pair.xml").write_text(MODEL)
     with under_way(NO_PROCESSES, "import", str(tmp_path / "pair.xml"), "--out", str(tmp_path / "out")) as process:
         _, err = process.communicate(timeout=60)

@@ -1,4 +1,4 @@
-"""Figures: what is drawn where, against closed forms."""
+"""Figures of runs, compared with closed forms."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def motion(swing):
 
 def lines(ax, colour=None, style=None):
     """Lines of an axes with their (x, y), by colour and line style."""
-    found = [
+    result = [
         line
         for line in ax.get_lines()
         if (colour is None or np.allclose(to_rgb(line.get_color()), to_rgb(colour)))
         and (style is None or line.get_linestyle() == style)
     ]
-    return [np.array(line.get_data(), dtype=float) for line in found]
+    return [np.array(line.get_data(), dtype=float) for line in result]
 
 
 # --- Fig. 4 --------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ def test_fig_4_has_the_papers_panels(fig_4):
     assert velocities.get_ylabel() == r"$\dot q$ (rad/s)"
 
 
-def test_desired_ellipse_and_dots_are_equation_21(fig_4):
+def test_desired_ellipse_and_dots_agree_with_equation_21(fig_4):
     space, _, angles, velocities = fig_4["tracking"].axes
     (ellipse,) = lines(space, "black", ":")
     theta_1, theta_3 = ellipse
@@ -81,7 +81,7 @@ def test_desired_ellipse_and_dots_are_equation_21(fig_4):
     np.testing.assert_allclose(rates_3[1], np.pi / 4 * np.sin(rates_3[0]), atol=1e-12)
 
 
-def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking, fig_4):
+def test_spf_is_dashed_and_reduced_solid_in_equal_colours(tracking, fig_4):
     spf, reduced = tracking
     ax = fig_4["tracking"].axes[2]
     drawn = [line for line in ax.get_lines() if line.get_linestyle() != "None"]
@@ -91,7 +91,7 @@ def test_spf_is_dashed_on_reduced_solid_in_one_colour_a_coordinate(tracking, fig
         np.testing.assert_array_equal(line.get_ydata(), run.q_tree[:, column])
 
 
-def test_torque_maxima_stand_beside_the_papers(fig_4):
+def test_note_compares_torque_maxima_with_the_paper(fig_4):
     ax = fig_4["tracking"].axes[1]
     (note,) = [text.get_text() for text in ax.texts]
     assert "24.8 N m (paper: ≤ 30)" in note
@@ -122,7 +122,7 @@ def assert_legends_apart(figure, name=""):
     assert not [ax for ax in figure.axes if ax.get_tightbbox().overlaps(title)], name
 
 
-def test_trajectory_from_a_csv_is_rebuilt_from_the_saved_run_alone(tmp_path):
+def test_csv_trajectory_is_rebuilt_from_a_saved_run(tmp_path):
     t = np.linspace(0.0, 0.3, 31)
     table = np.column_stack([t, -1.43 + 0.1 * np.sin(t), -1.70 + 0.1 * t**2])
     name = "desired.csv"
@@ -158,7 +158,7 @@ def elbows_and_tip(theta_1: float, theta_3: float) -> np.ndarray:
     [(BLUE, (-1.43430851, -1.70733217)), (VERMILLION, (np.pi / 4, np.pi / 4))],
     ids=["initial", "desired"],
 )
-def test_linkages_of_fig_3a(fig_3, colour, angles):
+def test_fig_3a_shows_initial_and_desired_linkages(fig_3, colour, angles):
     ax = fig_3["set_point"].axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$ (m)", "$y$ (m)")
     ends = np.hstack(lines(ax, colour)).T
@@ -193,7 +193,7 @@ def test_checks_show_residual_energy_and_lyapunov_function(set_point, fig_3):
 # --- anything else -------------------------------------------------------------------------------
 
 
-def test_motion_without_control(swing, motion):
+def test_motion_figure_shows_energy_drift_and_residual(swing, motion):
     assert list(motion) == ["motion", "motion_snapshots"]
     joints, rates, drift, residual = motion["motion"].axes
     assert len(lines(joints)) == len(lines(rates)) == 4
@@ -214,7 +214,7 @@ def test_snapshots_are_poses_at_equal_times(swing, motion):
             assert np.linalg.norm(ends - elbow, axis=1).min() < 1e-12
 
 
-def test_loop_forces_are_those_of_rows_that_are_lengths(tmp_path):
+def test_loop_forces_use_rows_in_metres(tmp_path):
     run = ckc_pin.simulate("three_rrr", {"t_end": 0.02})
     figure = draw_runs(run)["motion_snapshots"]
     shown = [line[1] for line in lines(figure.axes[1], style="-") if len(line[1]) == len(run.t)]
@@ -240,8 +240,8 @@ harmonics = [[0.3, 5.0, 0.0]]
     space = draw_runs(run)["tracking"].axes[0]
     assert "phase plane" in space.get_title(loc="left")
     assert (space.get_xlabel(), space.get_ylabel()) == (r"$\alpha$ (rad)", r"$\dot{\alpha}$ (rad/s)")
-    (wanted,) = lines(space, "black", ":")
-    np.testing.assert_allclose(((wanted[0] - 0.5) / 0.3) ** 2 + (wanted[1] / 1.5) ** 2, 1.0, atol=1e-12)
+    (desired,) = lines(space, "black", ":")
+    np.testing.assert_allclose(((desired[0] - 0.5) / 0.3) ** 2 + (desired[1] / 1.5) ** 2, 1.0, atol=1e-12)
 
 
 def test_three_freedoms_with_a_slide_have_an_axes_for_each_unit(tmp_path):
@@ -274,7 +274,7 @@ lift = 0.1
     assert {path.stem for path in written} == {"set_point", "set_point_checks", "set_point_snapshots"}
 
 
-def test_a_controller_of_ones_own(tmp_path):
+def test_python_controller_gets_the_tracking_layout(tmp_path):
     class Damper:
         def u(self, t, terms):
             return -0.2 * terms.q_dot
@@ -286,13 +286,13 @@ def test_a_controller_of_ones_own(tmp_path):
     np.testing.assert_array_equal(lines(figures["own"].axes[1], BLUE)[0][1], run.tau[:, 0])
 
 
-def test_runs_of_two_mechanisms_get_a_figure_each(swing, tmp_path):
+def test_each_mechanism_gets_its_own_figure(swing, tmp_path):
     other = ckc_pin.simulate("five_bar_as_printed/swing", {"t_end": 0.1})
     stems = ["five_bar_motion", "five_bar_as_printed_motion"]
     assert list(draw_runs([swing, other])) == [f"{stem}{more}" for stem in stems for more in ("", "_snapshots")]
 
 
-def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
+def test_run_that_stopped_at_the_start_can_be_drawn(tracking, tmp_path):
     run = tracking[0]
     rows = {name: getattr(run, name)[:1] for name in ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
     stopped = replace(run, status="stopped", lyapunov=run.lyapunov[:1], **rows)
@@ -311,11 +311,11 @@ def test_a_run_that_stopped_at_once_can_be_drawn(tracking, tmp_path):
         ("thetas", "thetas"),
     ],
 )
-def test_symbols_of_the_paper_and_names_as_they_are(name, shown):
+def test_greek_names_become_symbols_and_others_are_escaped(name, shown):
     assert coordinate_symbol(name) == shown
 
 
-def test_run_labels_tell_runs_apart(tracking, swing):
+def test_run_labels_are_distinct(tracking, swing):
     spf, reduced = tracking
     assert label_runs([reduced, spf]) == ["reduced", "SPF, ε = 10⁻⁴"]
     assert label_runs([reduced, swing]) == ["five_bar/tracking: reduced", "five_bar/swing: DAE"]

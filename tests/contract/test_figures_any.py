@@ -1,4 +1,4 @@
-"""Figures of any mechanism: many freedoms, hinges that spin, peaks that would hide the rest, planes with names."""
+"""Figures of other mechanisms: many freedoms, spinning hinges, short peaks, projection planes."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def stewart() -> ckc_pin.Run:
         ({"friction_smoothing": 0.1, "joint.crank.friction": 0.1}, "energy change"),
     ],
 )
-def test_what_dampers_take_is_no_drift(overrides, title):
+def test_energy_taken_by_dampers_is_not_called_drift(overrides, title):
     """Drift is what an integrator does to an energy that should stay."""
     run = ckc_pin.simulate("slider_crank", {"t_end": 0.05, **overrides})
     titles = [ax.get_title("left") for ax in draw_runs(run)["motion"].axes]
     assert [said for said in titles if "energy" in said] == [f"c)  {title}"]
 
 
-def test_six_coordinates_have_a_colour_of_their_own_and_each_a_panel(stewart):
+def test_six_coordinates_have_colours_and_all_have_small_panels(stewart):
     figures = draw_runs(stewart)
     assert list(figures) == ["motion", "motion_snapshots", "motion_coordinates"]
     drawn = [line.get_color() for line in figures["motion"].axes[0].get_lines()]
@@ -48,7 +48,7 @@ def test_six_coordinates_have_a_colour_of_their_own_and_each_a_panel(stewart):
     assert {ax.get_ylabel() for ax in panels} == {"(rad)", "(m)"}
 
 
-def test_more_motors_than_colours_lie_grey_behind_the_others():
+def test_motors_beyond_the_palette_are_grey_and_drawn_first():
     run = ckc_pin.simulate("two_ur5/lift", {"t_end": 0.05})
     figures = draw_runs(run)
     ax = figures["tracking"].axes[1]
@@ -62,7 +62,7 @@ def test_more_motors_than_colours_lie_grey_behind_the_others():
         assert_legends_apart(figure, name)
 
 
-def test_a_spinning_crank_is_wrapped():
+def test_spinning_crank_is_wrapped():
     run = ckc_pin.simulate("four_bar/turning", {"t_end": 1.0})
     crank = run.q_tree[:, run.column("crank")]
     assert np.ptp(crank) > 2 * np.pi
@@ -77,7 +77,7 @@ def test_a_spinning_crank_is_wrapped():
     assert "turns" in " ".join(ax.get_ylabel() for ax in many)
 
 
-def test_an_axis_is_cut_only_for_a_short_peak_at_an_end():
+def test_axis_is_clipped_only_for_a_short_peak_at_an_end():
     from matplotlib.figure import Figure
 
     t = np.linspace(0.0, 10.0, 1001)
@@ -97,7 +97,7 @@ def test_an_axis_is_cut_only_for_a_short_peak_at_an_end():
     assert clip_end_peaks(ax, [(t, np.full_like(calm, np.nan))], 10.0) == ""
 
 
-def test_spatial_mechanisms_are_seen_on_coordinate_planes(stewart):
+def test_spatial_mechanisms_are_drawn_on_coordinate_planes(stewart):
     shown = projection_planes(stewart.mechanism)
     assert [(plane.title, plane.names) for plane in shown] == [
         ("front", ("$x$", "$z$")), ("side", ("$y$", "$z$")), ("top", ("$x$", "$y$")),
@@ -109,7 +109,7 @@ def test_spatial_mechanisms_are_seen_on_coordinate_planes(stewart):
     assert len(front.patches) == 6 * 5  # a sleeve on each leg, in each pose
 
 
-def test_a_slider_stands_on_its_rail():
+def test_slider_is_drawn_on_its_rail():
     run = ckc_pin.simulate("slider_crank", {"t_end": 0.2})
     ax = draw_runs(run)["motion_snapshots"].axes[0]
     way = run.q_tree[:, run.column("slider")]
@@ -121,9 +121,9 @@ def test_a_slider_stands_on_its_rail():
     assert rail.get_xdata().max() > max(expected)
 
 
-def test_the_paper_is_cited_for_its_own_scenes_only(stewart):
-    own = draw_runs(ckc_pin.simulate("five_bar/set_point", {"t_end": 0.02}))["set_point"]
-    assert "Fig. 3, eq. 14" in " ".join(text.get_text() for text in own.texts)
+def test_paper_is_cited_for_its_scenes_only(stewart):
+    figure = draw_runs(ckc_pin.simulate("five_bar/set_point", {"t_end": 0.02}))["set_point"]
+    assert "Fig. 3, eq. 14" in " ".join(text.get_text() for text in figure.texts)
     other = draw_runs(ckc_pin.simulate("delta/circle", {"t_end": 0.02}))["tracking"]
     words = " ".join([*(text.get_text() for text in other.texts), *(ax.get_title(loc="left") for ax in other.axes)])
     assert not {"eq.", "paper", "Fig."} & set(words.replace(",", " ").split())

@@ -1,4 +1,4 @@
-"""Figures: their manners towards the user's matplotlib and disk."""
+"""Figures do not depend on, or change, the user's matplotlib settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.view.figures import plot_runs
 
 
-def test_files_are_the_same_whatever_the_user_has_set(swing, tmp_path):
+def test_figure_files_do_not_depend_on_user_settings(swing, tmp_path):
     formats = ("png", "svg")
     plain = [path.read_bytes() for path in plot_runs(swing, tmp_path / "plain", formats)]
     assert plain[0].startswith(b"\x89PNG")
@@ -23,7 +23,7 @@ def test_files_are_the_same_whatever_the_user_has_set(swing, tmp_path):
     assert styled == plain
 
 
-def test_pyplot_stays_out(tmp_path):
+def test_drawing_does_not_import_pyplot(tmp_path):
     code = (
         "import sys, ckc_pin; from ckc_pin.view.figures import plot_runs\n"
         "run = ckc_pin.simulate('five_bar/swing', {'t_end': 0.05})\n"
@@ -37,7 +37,7 @@ def test_pyplot_stays_out(tmp_path):
     ]
 
 
-def test_bad_input(swing, tmp_path):
+def test_invalid_arguments_are_rejected(swing, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="no run given"):
         plot_runs([], tmp_path)

@@ -1,4 +1,4 @@
-"""Units: one notation, θ₁ (rad), in all that is drawn or printed; and what figures of ensembles name."""
+"""Units have one notation, θ₁ (rad), in figures and text; and the contents of ensemble figures."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ PLACES = ("examples", "ckc_pin", "scripts")
 @pytest.mark.parametrize(
     "said", ["t / s", "rate [rad/s]", "q, q̇ [rad, rad/s]", "at t, s", "stable at / rad", "tau [N m]"]
 )
-def test_other_notations_are_known(said):
+def test_other_unit_notations_are_detected(said):
     assert OTHER.search(said)
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_units_stand_in_brackets(place):
-    found = [
+def test_units_are_in_parentheses(place):
+    matches = [
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.value}"
         for path in sorted((ROOT / place).rglob("*.py"))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
         if "\n" not in node.value and OTHER.search(node.value)
     ]
-    assert not found
+    assert not matches
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def drawn(monkeypatch):
     return figures
 
 
-def test_basins_show_every_member(drawn):
+def test_basin_figure_shows_every_member(drawn):
     """More basins than there are colours: those that have none are shown in one that says so."""
     basins, each = 9, 4
     ends = np.repeat(np.arange(basins, dtype=float), each)
@@ -67,7 +67,7 @@ def test_basins_show_every_member(drawn):
     assert ax.get_ylabel() == "key"
 
 
-def test_fans_have_the_quantiles_and_the_unit(drawn):
+def test_quantile_figure_has_bands_and_units(drawn):
     values = np.arange(101.0)[:, np.newaxis, np.newaxis] * np.ones((1, 2, 5))
     x = xr.DataArray(values, dims=("member", "coordinate", "time"), name="error", attrs={"units": "rad"},
                      coords={"coordinate": ["theta_1", "theta_3"], "time": np.linspace(0, 1, 5)})  # fmt: skip

@@ -1,4 +1,4 @@
-"""Playback as a GIF: every instant in its place, without a browser."""
+"""Playback as a GIF: timing and positions, without a browser."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def frames(path: Path) -> list[Image.Image]:
         return [frame.copy() for frame in ImageSequence.Iterator(image)]
 
 
-def test_its_frames_take_as_long_as_the_run(swing: Run, tmp_path: Path) -> None:
+def test_gif_takes_as_long_as_the_run(swing: Run, tmp_path: Path) -> None:
     whole = frames(save_gif(swing, tmp_path / "a.gif"))
     slow = frames(save_gif(swing, tmp_path / "b.gif", speed=0.25))
     assert [len(whole), len(slow)] == [11, 41]
@@ -46,7 +46,7 @@ def test_its_frames_take_as_long_as_the_run(swing: Run, tmp_path: Path) -> None:
     assert {frame.convert("RGB").getpixel((2, frame.height - 2)) for frame in whole} == {(255, 255, 255)}
 
 
-def test_a_bar_is_where_the_closed_form_has_it(swing: Run) -> None:
+def test_bars_agree_with_closed_form_positions(swing: Run) -> None:
     """Ends of links by the angles alone; the base joins its two pins."""
     plane = projection_planes(swing.mechanism)[0]
     rows = np.array([0, 20, 50])
@@ -58,16 +58,16 @@ def test_a_bar_is_where_the_closed_form_has_it(swing: Run) -> None:
             e + L2 * np.array([np.cos(a), np.sin(a)]) for e, a in zip(elbows, (one + two, three + four), strict=True)
         ]
         drawn = project_outline(swing.mechanism, moved.select_row(k), plane)
-        wanted = [[[0, 0], elbows[0]], [elbows[0], tips[0]], [[BASE, 0], elbows[1]], [elbows[1], tips[1]]]
-        for bar in wanted:
-            assert min(np.abs(own - np.array(bar)).max() for own in drawn.bars) < 1e-9
+        expected = [[[0, 0], elbows[0]], [elbows[0], tips[0]], [[BASE, 0], elbows[1]], [elbows[1], tips[1]]]
+        for bar in expected:
+            assert min(np.abs(drawn_bar - np.array(bar)).max() for drawn_bar in drawn.bars) < 1e-9
         for ring in (*elbows, *tips, [0, 0], [BASE, 0]):
             assert np.abs(drawn.rings - ring).max(axis=1).min() < 1e-9
         assert drawn.blocks == []
     assert [bar.tolist() for bar in project_base(swing.mechanism, moved, plane)[0]] == [[[0, 0], [BASE, 0]]]
 
 
-def test_a_slider_goes_along_its_rail() -> None:
+def test_slider_moves_along_its_rail() -> None:
     mechanism = load("slider_crank")
     run = simulate("slider_crank", {"t_end": 0.3})
     moved = compute_placements(mechanism, pinocchio_configurations(run))
@@ -80,7 +80,7 @@ def test_a_slider_goes_along_its_rail() -> None:
     assert rail[:, 0].min() < middles[:, 0].min() < middles[:, 0].max() < rail[:, 0].max()
 
 
-def test_the_picture_moves_as_the_run_does(swing: Run, tmp_path: Path) -> None:
+def test_frames_show_the_pose_at_their_time(swing: Run, tmp_path: Path) -> None:
     """What is blue lies around the middle of the links, in one scale, upwards where y grows."""
     pictures = [np.asarray(frame.convert("RGB")).astype(int) for frame in frames(save_gif(swing, tmp_path / "a.gif"))]
     blue = [np.abs(picture - BLUE).max(axis=2) < 60 for picture in pictures]
@@ -93,13 +93,13 @@ def test_the_picture_moves_as_the_run_does(swing: Run, tmp_path: Path) -> None:
     x, y = np.array([np.average([bar.mean(axis=0) for bar in each], axis=0, weights=lengths) for each in bars]).T
     one, none = np.ones(11), np.zeros(11)
     equations = np.vstack([np.column_stack([x, one, none]), np.column_stack([-y, none, one])])
-    found, *_ = np.linalg.lstsq(equations, middles.T.ravel())
-    off = np.abs(equations @ found - middles.T.ravel()).max()
+    answer, *_ = np.linalg.lstsq(equations, middles.T.ravel())
+    off = np.abs(equations @ answer - middles.T.ravel()).max()
     assert off < 0.05 * np.ptp(middles[:, 0])
-    assert found[0] > 500, "pixels a metre"
+    assert answer[0] > 500, "pixels a metre"
 
 
-def test_several_runs_with_what_was_wanted_and_of_robots_in_space(tmp_path: Path) -> None:
+def test_gif_shows_several_runs_desired_poses_and_spatial_robots(tmp_path: Path) -> None:
     runs = [simulate("five_bar/tracking", {"t_end": 0.3, "formulation": name}) for name in ("reduced", "spf")]
     one, both = (save_gif(which, tmp_path / f"{len(which)}.gif") for which in (runs[:1], runs))
     assert frames(one)[0].size[1] != frames(both)[0].size[1] or one.read_bytes() != both.read_bytes()
@@ -107,11 +107,11 @@ def test_several_runs_with_what_was_wanted_and_of_robots_in_space(tmp_path: Path
     assert len(frames(save_gif(lift, tmp_path / "delta.gif"))) == 5
 
 
-def test_the_command_and_the_notebook_write_it(swing: Run, tmp_path: Path) -> None:
+def test_command_and_notebook_write_gifs(swing: Run, tmp_path: Path) -> None:
     swing.save(tmp_path / "run.npz")
-    found = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"))
-    assert found.code == 0, found.err
-    assert found.out == f"written: {tmp_path / 'own.gif'}\n"
+    answer = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"))
+    assert answer.code == 0, answer.err
+    assert answer.out == f"written: {tmp_path / 'own.gif'}\n"
     playback = ckc_pin.play(swing, inline=True)
     assert playback.save(tmp_path / "again.gif").read_bytes() == (tmp_path / "own.gif").read_bytes()
 
@@ -125,15 +125,15 @@ def test_the_command_and_the_notebook_write_it(swing: Run, tmp_path: Path) -> No
         (["--gif", "nowhere/x.gif"], "nowhere/x.gif: cannot be written"),
     ],
 )
-def test_what_cannot_be_is_refused(options: list[str], says: str, swing: Run, tmp_path: Path) -> None:
+def test_invalid_gif_options_are_rejected(options: list[str], says: str, swing: Run, tmp_path: Path) -> None:
     swing.save(tmp_path / "run.npz")
-    found = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"), *options)
-    assert found.code == 2
-    assert says in found.err
+    answer = ckc("play", str(tmp_path / "run.npz"), "--gif", str(tmp_path / "own.gif"), *options)
+    assert answer.code == 2
+    assert says in answer.err
     assert not (tmp_path / "own.gif").exists()
 
 
-def test_runs_of_two_mechanisms_are_refused(swing: Run, tmp_path: Path) -> None:
+def test_runs_of_two_mechanisms_are_rejected(swing: Run, tmp_path: Path) -> None:
     other = simulate("slider_crank", {"t_end": 0.1})
     with pytest.raises(InputError, match="play runs of different mechanisms one by one"):
         save_gif([swing, other], tmp_path / "x.gif")

@@ -1,4 +1,4 @@
-"""Figures of linear models and loci: all poles are seen, no rounding is, letters are inside."""
+"""Figures of linear models and root loci: all poles are visible, rounding is not."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ckc_pin import InputError, Mechanism, Tracking, gain_locus, linearize, load
 from ckc_pin.scene.parts import build_scene_controller
 
 
-def test_a_locus_without_imaginary_parts_shows_no_rounding() -> None:
+def test_locus_of_real_poles_shows_no_rounding() -> None:
     locus = gain_locus("five_bar/tracking", "Lambda")
     assert locus is not None
     ax = plot(locus)["locus"].axes[0]
     assert ax.get_ylim()[1] > 0.05 * np.abs(locus.eigenvalues).max()
     assert "at the start of the desired motion" in ax.figure.get_suptitle()
-    own = int(np.argmin(np.abs(locus.factors - 1)))
-    assert np.array_equal(np.unique(np.round(locus.eigenvalues[own], 6)), np.unique(np.round(_by_hand(), 6)))
+    scene_index = int(np.argmin(np.abs(locus.factors - 1)))
+    assert np.array_equal(np.unique(np.round(locus.eigenvalues[scene_index], 6)), np.unique(np.round(_by_hand(), 6)))
     assert "at its target" in plot(gain_locus("five_bar/set_point", "K_V"))["locus"].get_suptitle()
     rubs = gain_locus("talos/squat")
     assert rubs is not None
@@ -40,7 +40,7 @@ def _by_hand() -> np.ndarray:
     return np.concatenate([outer, np.linalg.eigvals(-law.Lambda)])
 
 
-def test_poles_far_apart_are_all_seen_and_equal_ones_counted(tmp_path: Path) -> None:
+def test_separated_poles_are_visible_and_coincident_ones_counted(tmp_path: Path) -> None:
     ax = plot(linearize(_stiff_and_free(tmp_path)))["poles"].axes[0]
     assert ax.get_yscale() == "symlog"
     assert [text.get_text() for text in ax.texts] == ["×2"]
@@ -62,7 +62,7 @@ def _stiff_and_free(folder: Path) -> Mechanism:
     return load(str(folder / "mechanism.toml"))
 
 
-def test_modes_that_swing_come_before_others_in_a_figure(tmp_path: Path) -> None:
+def test_oscillating_modes_are_drawn_first(tmp_path: Path) -> None:
     figure = plot(linearize(_stiff_and_free(tmp_path)))["modes"]
     assert [ax.get_title(loc="left")[:2] for ax in figure.axes] == ["3:", "4:"]
     assert "2 rigid not shown" in figure.get_suptitle()
@@ -71,15 +71,15 @@ def test_modes_that_swing_come_before_others_in_a_figure(tmp_path: Path) -> None
     assert figure.bbox.x0 <= label.x0 < label.x1 <= figure.bbox.x1
 
 
-def test_a_locus_shows_itself_on_a_few_lines() -> None:
-    found = gain_locus("five_bar/set_point", "K_V")
-    lines = repr(found).splitlines()
+def test_repr_of_a_locus_is_short() -> None:
+    matches = gain_locus("five_bar/set_point", "K_V")
+    lines = repr(matches).splitlines()
     assert lines[0].startswith("GainLocus of five_bar/set_point, ")
     assert 3 <= len(lines) <= 8
     assert any(line.split()[:3] == ["K_V", "times", "1"] for line in lines)
 
 
-def test_what_cannot_be_drawn_or_played_is_refused() -> None:
+def test_results_that_cannot_be_drawn_or_played_are_rejected() -> None:
     model, scene = linearize("five_bar"), load_scene("five_bar/set_point")
     with pytest.raises(InputError, match="give each other result alone"):
         plot(model, model)

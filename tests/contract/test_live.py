@@ -1,4 +1,4 @@
-"""A simulation watched while it computes: frames are right, dropped when nobody takes them, and cost the run none."""
+"""Live view: frames are correct, skipped for slow viewers, and cost the simulation nothing."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ NO_SHAPE = '<link name="crank"><visual><geometry><box size="1 2"/></geometry></v
 Viewer = Callable[[WebSocketClientConnection], Coroutine[Any, Any, list[dict]]]
 
 
-def beside(url: str, viewer: Viewer) -> tuple[Thread, list[dict]]:
+def start_viewer(url: str, viewer: Viewer) -> tuple[Thread, list[dict]]:
     """Start a viewer in a thread of its own; it is connected, and has been drawn for, when this returns."""
     seen: list[dict] = []
     here = socket.socketpair()
 
-    async def look() -> None:
+    async def receive() -> None:
         connection = await websocket_connect(url.replace("http", "ws"), max_message_size=2**26)
         await connection.read_message()  # the scene has been sent
         here[1].send(b"!")
         seen.extend(await viewer(connection))
         connection.close()
 
-    thread = Thread(target=lambda: asyncio.run(look()))
+    thread = Thread(target=lambda: asyncio.run(receive()))
     thread.start()
     assert here[0].recv(1) == b"!"
     for end in here:
@@ -90,7 +90,7 @@ def seen_live(viewer: Viewer, overrides: dict[str, Any]) -> tuple[ckc_pin.Run, l
     scene = ckc_pin.load_scene(SWING, overrides)
     with live_view(scene, None) as view:
         assert view is not None
-        thread, seen = beside(view.server.url, viewer)
+        thread, seen = start_viewer(view.server.url, viewer)
         run = ckc_pin.simulate(scene, on_output=view.on_output)
     thread.join(20)
     assert not thread.is_alive()
@@ -98,11 +98,11 @@ def seen_live(viewer: Viewer, overrides: dict[str, Any]) -> tuple[ckc_pin.Run, l
 
 
 @pytest.mark.parametrize("viewer", [answering, silent])
-def test_the_run_is_the_same_whoever_looks(viewer, run):
+def test_run_is_identical_with_and_without_viewers(viewer, run):
     assert_same(seen_live(viewer, {})[0], run(SWING))
 
 
-def test_a_viewer_that_vanishes_ends_no_run(run, caplog):
+def test_lost_connection_does_not_stop_a_run(run, caplog):
     scene = ckc_pin.load_scene(SWING)
     with live_view(scene, None) as view:
         viewers = [raw_viewer(view.server) for _ in range(3)]
@@ -124,26 +124,26 @@ def assert_same(seen: ckc_pin.Run, alone: ckc_pin.Run) -> None:
     assert (seen.status, seen.stats["rhs"]) == ("done", alone.stats["rhs"])
 
 
-def test_frames_show_the_run_in_order_up_to_its_end():
+def test_live_frames_are_in_order_and_reach_the_end():
     run, frames = seen_live(answering, {})
     times = [time_of(frame) for frame in frames]
     assert times == sorted(set(times))
     assert times[-1] == 2.0
     for frame in frames:
         row = run.at(time_of(frame))  # the caption has two digits; output instants are 0.004 s apart
-        near = slice(max(row - 2, 0), row + 3)
-        angle = run.q_tree[near, run.column("theta_1")]
+        neighbours = slice(max(row - 2, 0), row + 3)
+        angle = run.q_tree[neighbours, run.column("theta_1")]
         expected = L_PROXIMAL * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
         assert np.abs(expected - elbow_of(frame)).max(axis=1).min() < 1e-12
 
 
-def test_a_viewer_that_does_not_answer_gets_one_frame_and_the_last():
+def test_unresponsive_viewer_gets_the_first_and_the_last_frame():
     _, frames = seen_live(silent, {})
     assert len(frames) <= 2
     assert time_of(frames[-1]) == 2.0
 
 
-def test_only_the_newest_instant_is_kept():
+def test_live_view_keeps_only_the_newest_output_time():
     view = LiveView(ckc_pin.load_scene(SWING), None)
     try:
         for k in range(10_000):
@@ -155,7 +155,7 @@ def test_only_the_newest_instant_is_kept():
         view.server.stop()
 
 
-def test_speed_says_which_instants_are_due(monkeypatch):
+def test_live_view_at_a_speed_shows_due_output_times(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(live, "perf_counter", lambda: clock[0])
     view = LiveView(ckc_pin.load_scene(SWING), 0.5)
@@ -173,7 +173,7 @@ def test_speed_says_which_instants_are_due(monkeypatch):
         view.server.stop()
 
 
-def test_the_view_waits_for_the_slower_speed_and_not_longer(monkeypatch, run):
+def test_finish_waits_for_a_slower_view_only(monkeypatch, run):
     waited = []
     clock = [100.0]
     monkeypatch.setattr(live, "perf_counter", lambda: clock[0])
@@ -193,7 +193,7 @@ def test_the_view_waits_for_the_slower_speed_and_not_longer(monkeypatch, run):
 
 @pytest.mark.parametrize(("setting", "status", "code"), [("t_end=0.1", "done", 0), ("solver.max_rhs=40", "stopped", 3)])
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_a_view_stays_until_it_is_ended_and_the_run_is_the_same_as_without(setting, status, code, sent):
+def test_live_command_stays_until_a_signal_and_saves_the_same_run(setting, status, code, sent):
     """In a pipe too: what it says is there when the run has ended, the page as long as nobody ends it."""
     with command(["run", SWING, "--set", setting, "--meshcat", "--json"], stderr=subprocess.PIPE) as process:
         try:
@@ -212,24 +212,24 @@ def test_a_view_stays_until_it_is_ended_and_the_run_is_the_same_as_without(setti
             process.kill()
 
 
-def test_a_port_in_use_ends_no_run():
+def test_port_in_use_does_not_prevent_a_run():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        found = ckc("run", SWING, "--set", "t_end=0.1", "--meshcat", "--port", str(port), "--json")
-    assert found.code == 0
-    assert found.json["status"] == "done"
-    assert found.err == (
+        answer = ckc("run", SWING, "--set", "t_end=0.1", "--meshcat", "--port", str(port), "--json")
+    assert answer.code == 0
+    assert answer.json["status"] == "done"
+    assert answer.err == (
         f"no live view: port {port} on 127.0.0.1: address already in use; choose another, or 0 for any free one; "
         "the run goes on without\n"
     )
 
 
-def test_shapes_that_cannot_be_drawn_end_no_run(tmp_path):
+def test_invalid_visuals_do_not_prevent_a_run(tmp_path):
     urdf = FOUR_BAR.replace('<link name="crank">', NO_SHAPE)
     path = write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, START_OF_FOUR_BAR, 0.01)
-    found = ckc("run", str(path), "--meshcat", "--json")
-    assert (found.code, found.json["status"]) == (0, "done")
-    assert "no live view: m.urdf: link 'crank', <visual>: a box needs size above zero" in found.err
+    answer = ckc("run", str(path), "--meshcat", "--json")
+    assert (answer.code, answer.json["status"]) == (0, "done")
+    assert "no live view: m.urdf: link 'crank', <visual>: a box needs size above zero" in answer.err
 
 
 @pytest.mark.parametrize(
@@ -244,14 +244,14 @@ def test_shapes_that_cannot_be_drawn_end_no_run(tmp_path):
         (["--meshcat", "--speed", "fast"], "Invalid value for '--speed'"),
     ],
 )
-def test_options_that_cannot_be(words, says):
-    found = ckc("run", SWING, *words)
-    assert (found.code, found.out) == (2, "")
-    assert says in found.err
+def test_invalid_view_options_are_rejected(words, says):
+    answer = ckc("run", SWING, *words)
+    assert (answer.code, answer.out) == (2, "")
+    assert says in answer.err
 
 
 @pytest.mark.parametrize("words", [["run", SWING, "--meshcat", "--speed", "0.01"], ["play", "RUN"]])
-def test_a_view_listens_on_one_port_of_loopback_and_has_no_children(words, run, tmp_path):
+def test_live_view_listens_on_loopback_and_starts_no_process(words, run, tmp_path):
     """As a command of its own, read from outside."""
     words = [str(run(SWING).save(tmp_path / "run.npz")) if word == "RUN" else word for word in words]
     with command(words) as process:
@@ -264,7 +264,7 @@ def test_a_view_listens_on_one_port_of_loopback_and_has_no_children(words, run, 
             process.terminate()
 
 
-def test_the_map_listens_on_nothing():
+def test_map_command_opens_no_port():
     seen, looks = set(), 0
     with command(["map", "four_bar", "--cells", "16"]) as process:
         while process.poll() is None:

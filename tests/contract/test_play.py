@@ -1,4 +1,4 @@
-"""Playback: what the viewer is told."""
+"""Playback: the drawing commands for the viewer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.contract.sketches import ARM, FOUR_BAR, FOUR_BAR_LOOP, START_OF_ARM, 
 L_PROXIMAL, L_DISTAL, BASE = 0.2794, 0.3048, 0.3048  # of five_bar
 
 
-def test_page_and_viewer_are_served(serve, swing):
+def test_server_sends_page_and_scripts(serve, swing):
     server = serve(swing)
     with urlopen(server.url) as answer:
         page = answer.read().decode()
@@ -91,7 +91,7 @@ def opacities(drawing: list[dict]) -> dict[str, float]:
     return {path: obj["materials"][0].get("opacity", 1) for path, obj in objects(drawing).items()}
 
 
-def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
+def test_second_run_is_translucent_and_simultaneous(tracking, swing):
     drawing = draw_runs_3d([tracking, swing])
     opacity = {path: x for path, x in opacities(drawing).items() if "/desired/" not in path}
     first, second = "/world/1: five_bar%2Ftracking: reduced", "/world/2: five_bar%2Fswing: DAE"
@@ -103,7 +103,7 @@ def test_second_run_is_translucent_and_moves_at_the_same_time(tracking, swing):
     assert moved[f"{second}/joint:theta_1"][0][-1] == pytest.approx(2.0)
 
 
-def test_the_spf_lies_translucent_on_the_reduced_model_whatever_the_order(serve, run, tracking):
+def test_spf_is_translucent_on_the_reduced_model_in_any_order(serve, run, tracking):
     server = serve(run("five_bar/tracking"), tracking)
     with urlopen(server.url) as answer:
         page = answer.read().decode()
@@ -112,7 +112,7 @@ def test_the_spf_lies_translucent_on_the_reduced_model_whatever_the_order(serve,
     assert {x for path, x in opacity.items() if path.startswith("/world/2: SPF")} == {0.4}
 
 
-def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
+def test_ghost_follows_equation_21_on_the_branch_of_the_run(tracking):
     drawing = draw_runs_3d([tracking])
     root, moved = "/world/1: reduced/desired", tracks(drawing)
     assert {x for path, x in opacities(drawing).items() if path.startswith(root)} == {0.22}
@@ -132,7 +132,7 @@ def test_the_ghost_is_equation_21_closed_on_the_branch_of_the_run(tracking):
         np.testing.assert_allclose((position + rotated(quaternion, np.array([L_DISTAL, 0, 0])))[:, :2], tip, atol=1e-6)
 
 
-def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
+def test_ghost_is_hidden_while_unreachable():
     overrides = {"controller.desired.theta_1.harmonics": [[2.2, 10.0, 0.0]], "t_end": 0.3, "formulation": "reduced"}
     drawing = draw_runs_3d([ckc_pin.simulate("five_bar/tracking", overrides)])
     (animation,) = [c for c in drawing if c["type"] == "set_animation"]
@@ -148,7 +148,7 @@ def test_the_ghost_is_hidden_where_the_mechanism_cannot_be():
     assert {True, False} == set(track["values"])
 
 
-def test_all_output_instants_are_keyframes_unless_there_are_very_many(swing):
+def test_output_times_are_keyframes_up_to_a_limit(swing):
     for speed in (0.25, 1.0, 10.0):
         drawing = draw_runs_3d([swing], speed=speed)
         times = tracks(drawing)["/world/1: DAE/joint:theta_1"][0]
@@ -173,7 +173,7 @@ def test_quaternions_are_continuous(tmp_path):
 # --- the side to look from -----------------------------------------------------------------------
 
 
-def test_a_planar_mechanism_faces_the_viewer(swing, tmp_path):
+def test_planar_mechanism_faces_the_viewer(swing, tmp_path):
     # In the viewer's scene x is right, z is up, and the camera looks along +y.
     five_bar = placed(draw_runs_3d([swing]))[:3, :3]
     np.testing.assert_allclose(five_bar @ np.eye(3), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-12)
@@ -184,7 +184,7 @@ def test_a_planar_mechanism_faces_the_viewer(swing, tmp_path):
     )  # x-z plane, gravity along -z
 
 
-def test_all_of_the_motion_is_in_sight(tracking):
+def test_whole_motion_is_in_sight(tracking):
     drawing = draw_runs_3d([tracking])
     (distance,) = [c["value"][2] for c in drawing if c.get("property") == "position"]
     (angle,) = [c["value"] for c in drawing if c.get("property") == "fov"]
@@ -195,7 +195,7 @@ def test_all_of_the_motion_is_in_sight(tracking):
     assert np.abs(tip[:, [0, 2]]).max() > 0.2 * distance * np.tan(np.radians(angle / 2))  # and not from afar
 
 
-def test_any_other_mechanism_stands_upright_below_the_camera(tmp_path):
+def test_spatial_mechanism_stands_upright_below_the_camera(tmp_path):
     for k, (gravity, up) in enumerate(
         [("[0, 0, -9.81]", [0, 0, 1]), ("[0, -9.81, 0]", [0, 1, 0]), ("[3, 0, 4]", None)]
     ):
@@ -212,7 +212,7 @@ def test_any_other_mechanism_stands_upright_below_the_camera(tmp_path):
 # --- mechanisms without pictures -----------------------------------------------------------------
 
 
-def test_links_without_shapes_are_drawn_as_rods(tmp_path):
+def test_links_without_visuals_are_drawn_as_rods(tmp_path):
     mesh = '<visual><geometry><mesh filename="missing.stl"/></geometry></visual>'
     urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank">{mesh}')
     q = "[initial.q]\nalpha = -0.5\n"
@@ -226,7 +226,7 @@ def test_links_without_shapes_are_drawn_as_rods(tmp_path):
     np.testing.assert_allclose(placement @ [0, -0.25, 0, 1], [0, 0, 0, 1], atol=1e-12)
 
 
-def test_a_slide_runs_on_a_rail_as_long_as_its_way(tmp_path):
+def test_rail_is_as_long_as_the_slides_travel(tmp_path):
     run = ckc_pin.simulate(write_scene(tmp_path / "m", ARM, "", START_OF_ARM, 0.3))
     way = run.q_tree[:, run.column("reach$/1")]
     ((path, rail),) = [(path, obj) for path, obj in objects(draw_runs_3d([run])).items() if "/rail:" in path]
@@ -236,7 +236,7 @@ def test_a_slide_runs_on_a_rail_as_long_as_its_way(tmp_path):
     np.testing.assert_allclose(ends, [0.2 + min(0, way.min()), 0.2 + max(0, way.max())], atol=1e-9)
 
 
-def test_links_of_one_colour_get_ours(tmp_path):
+def test_links_of_equal_colour_get_distinct_colours(tmp_path):
     grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
     ball = f'<visual><geometry><sphere radius="0.02"/></geometry>{grey}</visual>'
     urdf = ARM.replace("<inertial>", f"{ball}<inertial>")
@@ -257,7 +257,7 @@ def test_links_of_one_colour_get_ours(tmp_path):
         ('<geometry><sphere radius="1"/></geometry><material><color rgba="2 0 0 1"/></material>', "from 0 to 1"),
     ],
 )
-def test_a_shape_that_cannot_be_is_named(tmp_path, visual, message):
+def test_invalid_visuals_are_rejected(tmp_path, visual, message):
     urdf = FOUR_BAR.replace('<link name="crank">', f'<link name="crank"><visual>{visual}</visual>')
     q = "[initial.q]\nalpha = -0.5\n"
     run = ckc_pin.simulate(write_scene(tmp_path / "m", urdf, FOUR_BAR_LOOP, q, 0.01))
@@ -266,7 +266,7 @@ def test_a_shape_that_cannot_be_is_named(tmp_path, visual, message):
     assert message in str(error.value)
 
 
-def test_names_from_files_are_text_to_the_page(tmp_path):
+def test_names_are_escaped_in_the_page(tmp_path):
     path = write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, "[initial.q]\nalpha = -0.5\n", 0.01)
     hostile = path.rename(path.with_name("<script>alert(1)<.scene.toml"))
     with play_runs(ckc_pin.simulate(hostile), block=False) as server, urlopen(server.url) as answer:

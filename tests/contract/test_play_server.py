@@ -1,4 +1,4 @@
-"""Playback: who may listen, and that nothing stays behind."""
+"""Playback server: access control, and that it leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.contract.helpers.playback import leave, messages_to, objects, placed
 from tests.contract.helpers.viewer import listening, raw_viewer, vanish
 
 
-def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing):
+def test_later_viewer_gets_the_current_scene(serve, swing):
     server = serve(swing)
     count = len(server.scene_state.messages())
     first = messages_to(server, count)
@@ -40,7 +40,7 @@ def test_a_viewer_that_comes_later_sees_everything_as_it_is_by_then(serve, swing
     assert objects(second) == objects(first)
 
 
-def test_a_viewer_that_is_there_gets_it_at_once(serve, swing):
+def test_connected_viewer_gets_commands_immediately(serve, swing):
     server = serve(swing)
 
     async def listen() -> dict:
@@ -68,7 +68,7 @@ def status(server: ViewServer, path: str, **headers: str) -> int:
 
 
 @pytest.mark.parametrize("path", ["/", "/main.min.js", "/start.js", "/nothing"])
-def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
+def test_requests_of_other_hosts_and_origins_are_rejected(serve, swing, path):
     server = serve(swing)
     expected = 404 if path == "/nothing" else 200
     for name in ("127.0.0.1", "localhost"):
@@ -80,7 +80,7 @@ def test_only_our_own_host_and_origin_are_answered(serve, swing, path):
         assert status(server, path, Origin=origin) == 403
 
 
-def test_websockets_of_other_pages_are_refused(serve, swing):
+def test_websockets_of_other_pages_are_rejected(serve, swing):
     server = serve(swing)
     count = len(server.scene_state.messages())
     assert len(messages_to(server, count, Origin=f"http://localhost:{server.port}")) == count
@@ -90,13 +90,13 @@ def test_websockets_of_other_pages_are_refused(serve, swing):
         assert refused.value.code == 403
 
 
-def test_listens_on_loopback_only(serve, swing):
+def test_server_listens_on_loopback_only(serve, swing):
     before = listening()
     server = serve(swing)
     assert listening() - before == {f"0100007F:{server.port:04X}"}
 
 
-def test_a_port_in_use_is_said(serve, swing):
+def test_port_in_use_is_reported(serve, swing):
     taken = serve(swing).port
     with pytest.raises(InputError, match=rf"port {taken} on 127.0.0.1: address already in use; choose another"):
         serve(swing, port=taken)
@@ -105,7 +105,7 @@ def test_a_port_in_use_is_said(serve, swing):
             serve(swing, port=port)
 
 
-def test_bad_input(swing):
+def test_invalid_runs_and_speeds_are_rejected(swing):
     with pytest.raises(InputError, match="no run given"):
         play_runs([], block=False)
     for speed in (0.0, -1.0, float("nan"), float("inf")):
@@ -113,7 +113,7 @@ def test_bad_input(swing):
             play_runs(swing, speed=speed, block=False)
 
 
-def test_nothing_is_left_after_stop(swing):
+def test_stop_closes_threads_files_and_port(swing):
     threads, files = threading.enumerate(), len(os.listdir("/dev/fd"))
     server = play_runs(swing, block=False)
     messages_to(server, 3)
@@ -127,7 +127,7 @@ def test_nothing_is_left_after_stop(swing):
         assert again.port == server.port
 
 
-def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
+def test_lost_connection_is_no_error(serve, swing, caplog):
     server = serve(swing)
     vanish(raw_viewer(server))
     for _ in range(50):
@@ -142,7 +142,7 @@ def test_a_viewer_that_vanishes_is_no_error(serve, swing, caplog):
     assert not caplog.records
 
 
-def test_stop_does_not_wait_for_a_viewer_that_hangs(swing):
+def test_stop_does_not_wait_for_an_unresponsive_viewer(swing):
     server = play_runs(swing, block=False)
     with raw_viewer(server) as stalled:
         server.stop()
@@ -183,7 +183,7 @@ def test_playback_loads_no_zmq_and_drawing_no_tornado(swing, tmp_path):
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
 
 
-def test_a_browser_that_cannot_be_opened_is_said(swing, monkeypatch, capsys):
+def test_missing_browser_is_reported(swing, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("webbrowser.open", lambda url: bool(asked.append(url)))
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):

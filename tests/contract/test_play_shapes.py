@@ -1,4 +1,4 @@
-"""Playback of meshes, and of the gaps of loops."""
+"""Playback of meshes and of loop gaps."""
 
 from __future__ import annotations
 
@@ -60,20 +60,20 @@ def in_order(corners: np.ndarray) -> np.ndarray:
     return np.array(sorted(np.sort(t.round(6), axis=0).ravel().tolist() for t in corners))
 
 
-def test_a_mesh_is_drawn_where_its_link_is(tmp_path):
+def test_mesh_is_drawn_at_its_link(tmp_path):
     run = bar(tmp_path / "m", '<mesh filename="shapes/crank.stl" scale="2 1 1"/>')
     tetrahedron(tmp_path / "m" / "shapes" / "crank.stl")
     expected = np.array([np.array(TETRAHEDRON)[list(face)] * [2, 1, 1] + [0, 0, 0.3] for face in FACES])
     np.testing.assert_allclose(in_order(triangles(draw_runs_3d([run]))), in_order(expected), atol=1e-6)
 
 
-def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, capsys):
+def test_saved_run_loads_meshes_from_the_given_folder(tmp_path, capsys):
     saved = bar(tmp_path / "m", '<mesh filename="package://mine/shapes/crank.stl"/>').save(tmp_path / "run.npz")
     tetrahedron(tmp_path / "m" / "shapes" / "crank.stl")
     run = ckc_pin.Run.load(saved)
     page = save_html(run, tmp_path / "sticks.html")
     assert capsys.readouterr().err == (
-        "mesh files not found: package://mine/shapes/crank.stl; links are drawn as rods. "
+        "mesh files not result: package://mine/shapes/crank.stl; links are drawn as rods. "
         "--meshes DIR names their folder\n"
     )
     assert [path for path in objects(draw_runs_3d([run])) if "/joint:alpha/rod:" in path]
@@ -91,7 +91,7 @@ def test_a_saved_run_takes_its_meshes_from_the_folder_that_is_named(tmp_path, ca
 @pytest.mark.parametrize(
     "name", ["../crank.stl", "a/../../crank.stl", "{absolute}", "file://{absolute}", "link.stl", ""]
 )
-def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
+def test_meshes_outside_the_folder_are_not_opened(tmp_path, name):
     tetrahedron(tmp_path / "crank.stl")
     run = bar(tmp_path / "m", f'<mesh filename="{name.format(absolute=tmp_path / "crank.stl")}"/>')
     (tmp_path / "m" / "link.stl").symlink_to(tmp_path / "crank.stl")
@@ -101,7 +101,7 @@ def test_meshes_beside_the_folder_are_not_opened(tmp_path, name):
 
 
 @pytest.mark.parametrize("content", [b"", b"solid \n garbage", bytes(80) + struct.pack("<I", 2**31), b"\xff" * 200])
-def test_a_damaged_mesh_is_a_stick(tmp_path, content):
+def test_link_with_a_damaged_mesh_is_drawn_as_a_rod(tmp_path, content):
     run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
     (tmp_path / "m" / "crank.stl").write_bytes(content)
     drawn = objects(draw_runs_3d([run]))
@@ -109,7 +109,7 @@ def test_a_damaged_mesh_is_a_stick(tmp_path, content):
     assert [path for path in drawn if "/joint:alpha/rod:" in path]
 
 
-def test_links_of_a_robot_of_meshes_have_them(tmp_path):
+def test_all_meshes_of_a_robot_are_drawn(tmp_path):
     run = ckc_pin.simulate("two_ur5", {"t_end": 0.01})
     drawn = objects(draw_runs_3d([run]))
     meshes = [path for path, obj in drawn.items() if obj["geometries"][0]["type"] == "BufferGeometry"]
@@ -120,17 +120,17 @@ def test_links_of_a_robot_of_meshes_have_them(tmp_path):
 # --- gaps ----------------------------------------------------------------------------------------
 
 
-def test_gaps_are_what_the_loop_holds_at_zero(run):
+def test_gaps_are_the_constrained_offsets(run):
     off = run("five_bar/swing", formulation="spf", initial__w=[2e-3, -1e-3], t_end=0.05)
     mechanism = off.mechanism
-    found = compute_loop_gaps(mechanism, pinocchio_configurations(off))
-    assert list(found) == ["elbow"]
-    np.testing.assert_allclose(found["elbow"][:, :2], off.phi, atol=1e-15)  # its rows are x and y of the world
+    result = compute_loop_gaps(mechanism, pinocchio_configurations(off))
+    assert list(result) == ["elbow"]
+    np.testing.assert_allclose(result["elbow"][:, :2], off.phi, atol=1e-15)  # its rows are x and y of the world
     assert np.abs(off.phi[0]).max() == pytest.approx(2e-3)
-    assert not np.any(found["elbow"][:, 2])
+    assert not np.any(result["elbow"][:, 2])
 
 
-def test_gap_of_a_distance_is_along_its_rod(tmp_path):
+def test_gap_of_a_distance_loop_is_along_its_rod(tmp_path):
     rod = """
 [[loop]]
 name = "rod"
@@ -174,7 +174,7 @@ def test_magnified_gaps_run_from_frame_b(run):
 
 
 @pytest.mark.parametrize("gap", [-1.0, float("nan"), float("inf")])
-def test_a_gap_that_is_none(run, gap):
+def test_invalid_gap_factors_are_rejected(run, gap):
     with pytest.raises(ckc_pin.InputError, match="gap = "):
         play_runs(run("five_bar/swing"), gap=gap, block=False)
 
@@ -182,12 +182,12 @@ def test_a_gap_that_is_none(run, gap):
 # --- one file ------------------------------------------------------------------------------------
 
 
-def test_a_file_that_cannot_be_written(run, tmp_path):
+def test_unwritable_file_is_reported(run, tmp_path):
     with pytest.raises(ckc_pin.InputError, match=r"cannot be written: .*; choose a file in a folder that exists"):
         save_html(run("five_bar/swing"), tmp_path / "nowhere" / "x.html")
 
 
-def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
+def test_saved_page_contains_scene_and_names_as_text(tmp_path):
     path = write_scene(tmp_path / "m", FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, 0.01)
     hostile = path.rename(path.with_name("<script>alert(1)<.scene.toml"))
     run = ckc_pin.simulate(hostile)
@@ -199,8 +199,8 @@ def test_the_file_holds_the_scene_and_names_only_as_text(tmp_path):
     assert several["type"] == "several"
     arrays = several["arrays"]
     assert len({(array.code, bytes(array.data)) for array in arrays}) == len(arrays)  # each once
-    found = _resolved(several["commands"], arrays)
-    assert found == msgspec.msgpack.decode(msgspec.msgpack.encode(draw_runs_3d([run], speed=0.5)))
+    result = _resolved(several["commands"], arrays)
+    assert result == msgspec.msgpack.decode(msgspec.msgpack.encode(draw_runs_3d([run], speed=0.5)))
 
 
 def _resolved(value, arrays):
@@ -211,7 +211,7 @@ def _resolved(value, arrays):
     return [_resolved(one, arrays) for one in value] if isinstance(value, list) else value
 
 
-def test_corners_that_nobody_can_tell_apart_are_one(tmp_path):
+def test_coincident_corners_are_merged(tmp_path):
     run = bar(tmp_path / "m", '<mesh filename="crank.stl"/>')
     tetrahedron(tmp_path / "m" / "crank.stl")  # STL has each corner once for each of its triangles
     (drawn,) = [obj for path, obj in objects(draw_runs_3d([run])).items() if "/link:crank/" in path]
@@ -219,12 +219,12 @@ def test_corners_that_nobody_can_tell_apart_are_one(tmp_path):
     assert len(position.data) == 4 * 3 * 4
 
 
-def test_the_command_writes_the_same_file(run, tmp_path):
+def test_command_and_python_write_the_same_file(run, tmp_path):
     saved = run("five_bar/swing").save(tmp_path / "run.npz")
-    found = ckc("play", str(saved), "--html", str(tmp_path / "x.html"), "--gap", "100", "--speed", "2")
-    assert (found.code, found.out, found.err) == (0, f"written: {tmp_path / 'x.html'}\n", "")
-    own = save_html(ckc_pin.Run.load(saved), tmp_path / "own.html", gap=100.0, speed=2.0)
-    assert own.read_bytes() == (tmp_path / "x.html").read_bytes()
+    result = ckc("play", str(saved), "--html", str(tmp_path / "x.html"), "--gap", "100", "--speed", "2")
+    assert (result.code, result.out, result.err) == (0, f"written: {tmp_path / 'x.html'}\n", "")
+    saved_page = save_html(ckc_pin.Run.load(saved), tmp_path / "own.html", gap=100.0, speed=2.0)
+    assert saved_page.read_bytes() == (tmp_path / "x.html").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -237,14 +237,14 @@ def test_the_command_writes_the_same_file(run, tmp_path):
         (["--html", "no/where.html"], "no/where.html: cannot be written: No such file or directory; choose a file in"),
     ],
 )
-def test_what_the_command_cannot_do_is_said_in_one_line(run, tmp_path, words, says):
-    found = ckc("play", str(run("five_bar/swing").save(tmp_path / "run.npz")), *words)
-    assert (found.code, found.out) == (2, "")
-    assert found.err.startswith(f"error: {says}")
-    assert found.err.count("\n") == 1
+def test_invalid_play_options_are_rejected(run, tmp_path, words, says):
+    result = ckc("play", str(run("five_bar/swing").save(tmp_path / "run.npz")), *words)
+    assert (result.code, result.out) == (2, "")
+    assert result.err.startswith(f"error: {says}")
+    assert result.err.count("\n") == 1
 
 
-def test_no_two_hinges_at_one_point_of_a_body_have_balls(tmp_path: Path) -> None:
+def test_coincident_hinges_have_one_ball(tmp_path: Path) -> None:
     """They would flicker: on the crank's end beside the coupler, and on the base beside the crank."""
     more = "".join(
         f'<link name="{name}_link">{INERTIAL}</link><joint name="{name}" type="continuous"><parent link="{on}"/>'

@@ -1,4 +1,4 @@
-"""What a viewer is sent, taken apart."""
+"""Decode the messages that a viewer receives."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ def objects(drawing: list[dict]) -> dict[str, dict]:
 def tracks(drawing: list[dict]) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Times, positions and quaternions by path."""
     (animation,) = [c for c in drawing if c["type"] == "set_animation"]
-    found = {}
+    result = {}
     for one in animation["animations"]:
         position, quaternion = (one["clip"]["tracks"] * 2)[:2]
         if (position["name"], quaternion["name"]) != (".position", ".quaternion"):
             continue
         assert one["clip"]["fps"] == 1  # times are seconds
         times = floats(position["times"], 1)[:, 0]
-        found[one["path"]] = times, floats(position["values"], 3), floats(quaternion["values"], 4)
-    return found
+        result[one["path"]] = times, floats(position["values"], 3), floats(quaternion["values"], 4)
+    return result
 
 
 def matrix(columns: list[float]) -> np.ndarray:

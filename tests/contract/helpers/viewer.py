@@ -1,4 +1,4 @@
-"""A viewer made by hand, and what a process listens on."""
+"""A minimal viewer, and the addresses that a process listens on."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def vanish(viewer: socket.socket) -> None:
 def listening(pid: int | str = "self") -> set[str]:
     """Addresses that a process listens on, "IP:PORT" in hexadecimals as in the kernel's tables."""
     folder = Path(f"/proc/{pid}")
-    own = set()
+    sockets = set()
     for name in os.listdir(folder / "fd"):
         try:
-            own.add(os.readlink(folder / "fd" / name))
+            sockets.add(os.readlink(folder / "fd" / name))
         except FileNotFoundError:  # closed meanwhile
             continue
-    found = set()
+    addresses = set()
     for table in ("tcp", "tcp6", "udp", "udp6"):
         for line in (folder / "net" / table).read_text().splitlines()[1:]:
             fields = line.split()
-            if f"socket:[{fields[9]}]" in own and (table.startswith("udp") or fields[3] == "0A"):
-                found.add(fields[1])
-    return found
+            if f"socket:[{fields[9]}]" in sockets and (table.startswith("udp") or fields[3] == "0A"):
+                addresses.add(fields[1])
+    return addresses
