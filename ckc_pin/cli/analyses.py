@@ -61,7 +61,7 @@ MOMENT_TOLERANCE = 1e-9  # of the force times the mechanism's size: a smaller mo
 @options.figures
 @options.as_json
 def inverse(what: str, overrides: tuple[str, ...], out: Path | None, figures: bool, as_json: bool) -> None:
-    """Compute motor torques, loop and joint forces along a motion. It is a scene's desired motion, or that of a run."""
+    """Compute motor, loop and joint forces along a motion. It is a scene's desired motion, or that of a run."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)

@@ -62,7 +62,7 @@ def sweep(
     figures: bool,
     as_json: bool,
 ) -> None:
-    """Run a scene many times with other parameters.
+    """Run a scene with many parameter values.
 
     If the command is killed, the same command continues the sweep. The results do not depend on threads, chunks or
     workers.

@@ -119,7 +119,7 @@ def test_new_replaces_no_file(mine: Path, tmp_path: Path) -> None:
     for name in ("a b", "x/../*", "-", "ü"):
         answer = ckc("new", "--", name)
         assert answer.code == 2
-        assert "a name is of letters, digits, - and _" in answer.err
+        assert "a name consists of letters, digits, - and _" in answer.err
     answer = ckc("new", "")
     assert (answer.code, answer.err) == (2, "error: NAME is empty; give a name\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]

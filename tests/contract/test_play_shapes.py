@@ -73,7 +73,7 @@ def test_saved_run_loads_meshes_from_the_given_folder(tmp_path, capsys):
     run = ckc_pin.Run.load(saved)
     page = save_html(run, tmp_path / "sticks.html")
     assert capsys.readouterr().err == (
-        "mesh files not result: package://mine/shapes/crank.stl; links are drawn as rods. "
+        "mesh files not found: package://mine/shapes/crank.stl; links are drawn as rods. "
         "--meshes DIR names their folder\n"
     )
     assert [path for path in objects(draw_runs_3d([run])) if "/joint:alpha/rod:" in path]
