@@ -143,10 +143,10 @@ def _has_sound_sweep(attributes: Mapping[str, Any]) -> bool:
 
 def _checksum_attributes(attributes: Mapping[str, Any]) -> str:
     """Return the checksum of the attributes that this program writes, ignoring other attributes."""
-    written_keys = {
+    protected = {
         key: attributes.get(key) for key in ("format", "units", "sweep", "identity", "coordinates", "chunk", "files")
     }
-    return checksum(msgspec.json.encode(written_keys, order="deterministic")).hex()
+    return checksum(msgspec.json.encode(protected, order="deterministic")).hex()
 
 
 def restore_files(path: Path, create: Callable[[Path], None], files: Mapping[str, str]) -> list[str]:

@@ -139,14 +139,12 @@ class Stability(HasSummary):
         assert self.least_eigenvalue is not None
         rightmost = float(self.eigenvalues[0].real)
         if self.least_eigenvalue <= 0:
-            least = (
-                ""
-                if self.least_K_P is None
-                else f"; the least K_P in its proportions is {_format_gain(self.least_K_P, independent)}"
-            )
+            remedy = ""
+            if self.least_K_P is not None:
+                remedy = f"; the least K_P in its proportions is {_format_gain(self.least_K_P, independent)}"
             return [
                 f"the closed loop is unstable at its target: eigenvalue {rightmost:.3g} 1/s, and K_P + dh/dq has the "
-                f"eigenvalue {self.least_eigenvalue:.4g}{least}"
+                f"eigenvalue {self.least_eigenvalue:.4g}{remedy}"
             ]
         if self.multiplier is not None and rightmost < -DECAY_TOLERANCE * np.abs(self.eigenvalues).max():
             return [

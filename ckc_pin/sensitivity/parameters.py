@@ -117,7 +117,7 @@ def require_supported_scene(
         raise InputError("sensitivities support starts on phi = 0 only; remove initial.w")
     if spec.formulation == "dae" and (spec.solver.baumgarte or not spec.solver.projection):
         raise InputError("sensitivities need closed loops; remove solver.baumgarte, and set solver.projection = true")
-    shaping = next((x.name for x in parameters if any(effect.is_shape for effect in x.effects)), None)
+    shaping = next((x.name for x in parameters if any(contribution.is_shape for contribution in x.effects)), None)
     if shaping is not None and type(controller) is Tracking and isinstance(controller.desired, PointPath):
         raise InputError(
             f"sensitivities: {shaping}: the controller makes a point follow a path, so q_d depends on the mechanism's "
@@ -132,12 +132,12 @@ def require_supported_scene(
         # Joints that cannot move have no stick-slip events, so their friction needs no monitor.
         frictionless = (mechanism.joints.friction == 0) & ~mechanism.freedoms.immobile
         for x in parameters:
-            if any(effect.kind == "friction" and frictionless[effect.index] for effect in x.effects):
+            if any(contribution.kind == "friction" and frictionless[contribution.index] for contribution in x.effects):
                 raise InputError(
                     f"sensitivities: {x.name} is 0, so stick-slip events are not monitored; give a small value, "
                     f"{x.name} = 1e-6 in [parameters], or friction_smoothing"
                 )
-    plant = [x.name for x in parameters if any(effect.is_term for effect in x.effects)]
+    plant = [x.name for x in parameters if any(contribution.is_term for contribution in x.effects)]
     if type(controller) is Tracking and controller.model is None and plant:
         raise InputError(
             f"sensitivities: {plant[0]}: tracking computes u from the mechanism's terms, whose derivatives are not "
@@ -176,7 +176,7 @@ def require_movable(
         return
     present = values_of(mechanism.spec, mechanism.urdf)
     for x in parameters:
-        if not any(effect.is_shape for effect in x.effects):
+        if not any(contribution.is_shape for contribution in x.effects):
             continue
         whole, k = split_component(x.name)
         value = present[whole]
@@ -213,7 +213,7 @@ def at_assembled_stop(
     InputError
         q_guess is beyond the stop, so the start follows the stop in both directions.
     """
-    stop = next((effect for effect in x.effects if effect.kind in ("lower", "upper")), None)
+    stop = next((contribution for contribution in x.effects if contribution.kind in ("lower", "upper")), None)
     if stop is None:
         return x
     k, reach = stop.index, mechanism.tree.step_scale
@@ -289,13 +289,13 @@ def _mechanism_parameter(
     mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
 ) -> SensitivityParameter:
     """Return a parameter of the mechanism. Effects on reported points only do not act on the motion."""
-    effects = effects_of(mechanism, actuation, name, slopes)
-    placed = ["" if effect.lock is None else effect.lock.placed for effect in effects]
-    by_place = list(zip(placed, effects, strict=True))
+    contributions = effects_of(mechanism, actuation, name, slopes)
+    placed = ["" if contribution.lock is None else contribution.lock.placed for contribution in contributions]
+    by_place = list(zip(placed, contributions, strict=True))
     return SensitivityParameter(
         name,
-        tuple(effect for place, effect in by_place if place != "reported"),
-        places=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
+        tuple(contribution for place, contribution in by_place if place != "reported"),
+        places=tuple(contribution for place, contribution in by_place if place in ("joint", "reported")),
         slopes=slopes,
     )
 

@@ -288,7 +288,7 @@ def _explain_missing_derivative(ready: Prepared) -> str | None:
 def _require_independent_terms(ready: Prepared) -> None:
     """Refuse a caller's controller that has read terms which depend on the parameters (InputError)."""
     parameters = _sensitivity_parameters(ready)
-    name = next((x.name for x in parameters if any(effect.is_term for effect in x.effects)), None)
+    name = next((x.name for x in parameters if any(contribution.is_term for contribution in x.effects)), None)
     if name is not None and ready.loop.asked():
         raise InputError(
             f"sensitivities: {name}: the controller reads terms whose parameter dependence is unknown; "
@@ -383,11 +383,11 @@ def _displace_by_placement(
 ) -> Array:
     """Return the derivative of a point's position by its own placement and by that of the joints that carry it."""
     total = np.zeros(3)
-    for effect in parameter.places:
-        assert effect.lock is not None
-        placed, index = effect.lock.placed, effect.index
+    for contribution in parameter.places:
+        assert contribution.lock is not None
+        placed, index = contribution.lock.placed, contribution.index
         if (placed == "joint" and index in carriers) or (placed == "reported" and index == number):
-            axis = pose.rotation[effect.lock.carrier] @ effect.lock.axis
-            arm = position - pose.translation[effect.lock.carrier]
-            total += effect.numbers[0] * (np.cross(axis, arm) if effect.lock.turns else axis)
+            axis = pose.rotation[contribution.lock.carrier] @ contribution.lock.axis
+            arm = position - pose.translation[contribution.lock.carrier]
+            total += contribution.numbers[0] * (np.cross(axis, arm) if contribution.lock.turns else axis)
     return total

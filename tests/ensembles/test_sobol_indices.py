@@ -36,14 +36,14 @@ def write_sweep(at: Path, epsilon: str = "uniform = [0.1, 0.2]") -> Path:
 
 def test_energy_at_rest_is_linear_in_gravity(tmp_path: Path) -> None:
     task = load_sweep_task(write_sweep(tmp_path))
-    found = compute_sobol_indices(task, 64, 2)
+    indices = compute_sobol_indices(task, 64, 2)
     # E = c - sum of m g . p, so the shares have the ratio (p_x 1)^2 : (p_y 2)^2
     members = task.prepare(1)
     energy = members.run(0, np.array([[0, 0, 0.1], [1, 0, 0.1], [0, 1, 0.1]])).outputs["energy"]
     parts = np.array([energy[1] - energy[0], 2 * (energy[2] - energy[0]), 0.0]) ** 2
     for order in ("first_order", "total_order"):
-        assert np.allclose(found[order].sel(output="energy"), parts / parts.sum(), atol=0.15)
-    assert float(found["total_order"].sel(output="energy", variable="epsilon")) == pytest.approx(0, abs=1e-9)
+        assert np.allclose(indices[order].sel(output="energy"), parts / parts.sum(), atol=0.15)
+    assert float(indices["total_order"].sel(output="energy", variable="epsilon")) == pytest.approx(0, abs=1e-9)
 
 
 def test_the_command_writes_indices_and_a_figure(tmp_path: Path) -> None:

@@ -76,6 +76,6 @@ def test_a_joint_that_leaves_its_stop_without_speed(rtol: float, formulation: st
     scene, start = f"{FOLDER}/left_smoothly", 0.4079220041557603
     result = sensitivities(scene, [name], overrides)
     tight = {"solver.rtol": 1e-12, "formulation": formulation}
-    ahead, behind = (simulate(scene, {**tight, name: start + h}) for h in (1e-5, -1e-5))
-    expected = np.concatenate([ahead.q_tree[-1] - behind.q_tree[-1], ahead.v_tree[-1] - behind.v_tree[-1]]) / 2e-5
+    above, below = (simulate(scene, {**tight, name: start + h}) for h in (1e-5, -1e-5))
+    expected = np.concatenate([above.q_tree[-1] - below.q_tree[-1], above.v_tree[-1] - below.v_tree[-1]]) / 2e-5
     assert np.abs(ends(result) - expected).max() <= 1e-5 * np.abs(expected).max()

@@ -107,7 +107,7 @@ def test_the_start_of_a_free_root(tmp_path: Path) -> None:
         assert np.abs(ours - expected).max() <= TOLERANCE * np.abs(expected).max(), name
 
 
-def test_a_parameter_without_effect_has_zero_derivatives(tmp_path: Path) -> None:
+def test_an_idle_parameter_has_zero_derivatives(tmp_path: Path) -> None:
     scene = write_arms(tmp_path, "hinge", more='[[motor]]\njoint = "ra"\nratio = 5.0\nspeed_limit = 3.0\n' + REST)
     result = sensitivities(scene, ["motor.ra.speed_limit"], TIGHT)
     assert not np.concatenate([result.q_tree, result.v_tree], axis=1).any()

@@ -85,9 +85,9 @@ def test_an_inelastic_stop_that_releases_the_joint_at_once(tmp_path: Path) -> No
     """A force of 1.3 N pulls 1.3 kg back. With restitution e the joint leaves at e times its impact speed."""
     scene = write_sliders(tmp_path, joint("x", restitution=0.0) + force("x", -1.3), q_dot=(1.5, 0.0), upper=0.3)
     speed = np.sqrt(1.5**2 - 2 * 0.3)
-    left = 1.0 - (1.5 - speed)
+    remaining = 1.0 - (1.5 - speed)
     result = sensitivities(scene, ["joint.x.restitution"], TIGHT)
-    assert end(result, "joint.x.restitution") == pytest.approx([-speed * left, 0.0, -speed, 0.0], abs=1e-9)
+    assert end(result, "joint.x.restitution") == pytest.approx([-speed * remaining, 0.0, -speed, 0.0], abs=1e-9)
 
 
 def test_the_time_of_a_position_event_does_not_depend_on_a_later_stop(tmp_path: Path) -> None:
