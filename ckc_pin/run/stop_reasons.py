@@ -95,7 +95,7 @@ def describe_stop(
         case "beyond_stop":
             name = mechanism.coordinates[stop.event]
             return NumericalError(
-                f"{name} passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
+                f"{name} has passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
                 "beyond the stop finds the impact",
                 t=loop.t,
                 q_tree=where,

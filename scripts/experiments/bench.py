@@ -121,7 +121,7 @@ def again_us() -> float:
     def native() -> None:
         prepared.begin()
         prepared.loop.record(times, rows)
-        prepared.loop.advance(1e-3, True, 0.05, 60.0)
+        prepared.loop.advance(until=1e-3, final=True, pause=0.05, budget=60.0)
 
     return 1e6 * (least(lambda: run_prepared(prepared), 300) - least(native, 300))
 

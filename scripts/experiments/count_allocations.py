@@ -56,7 +56,7 @@ def main(library: Path) -> int:
 
         def stretch(end: float, loop: Any = loop) -> tuple[int, int, int]:
             stats, before = loop.stats(), counter()
-            loop.advance(end, False, 60.0, 60.0)
+            loop.advance(until=end, final=False, pause=60.0, budget=60.0)
             made = counter() - before
             now = loop.stats()
             return made, now["steps"] - stats["steps"], now["jacobians"] - stats["jacobians"]

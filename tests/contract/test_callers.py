@@ -20,10 +20,10 @@ SCENES = [
     ("five_bar/set_point", {"initial.w": [0.01, -0.01], "coriolis_velocity": "actual", "t_end": 0.2}),
     ("five_bar/set_point", {"initial.w": [0.01, -0.01], "spf_coordinates": "z", "t_end": 0.05}),
     ("delta/circle", {"formulation": "reduced", "t_end": 0.05}),
-    # by implicit steps its own slopes would be known, a caller's not
+    # Implicit steps would know the derivatives of the scene's controller, but not those of a caller's.
     ("stewart/wave", {"formulation": "dae", "t_end": 0.1, "solver.method": "DOP853"}),
 ]
-# all that a controller could ask for
+# all terms that a controller can use
 NAMES = ("D_tree", "C_tree", "h_tree", "bias_tree", "phi", "J_dot", "rho", "rho_dot", "D", "C", "h", "energy",
          "potential_energy", "q", "q_dot")  # fmt: skip
 
@@ -75,7 +75,7 @@ def test_stored_terms_do_not_change():
 
     mechanism = simulate(scene, controller=Keeps()).mechanism
     assert len({terms.t for terms in kept}) > 100
-    for terms in kept[::50]:  # never asked for anything while the loop was there
+    for terms in kept[::50]:  # no term was used during the call
         reference = Terms(mechanism, mechanism.kinematics(terms.q_tree), terms.v_tree)
         assert np.array_equal(terms.q, reference.q)
         assert np.abs(terms.C - reference.C).max() <= 1e-12

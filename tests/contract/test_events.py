@@ -62,7 +62,7 @@ R = 1e-4  # half the distance of two roots
 def test_sign_changes_within_a_step(function: Callable[[float], float], roots: list[tuple[float, int]]) -> None:
     roots_found, _, _ = _walk(function)
     assert [direction for _, direction in roots_found] == [direction for _, direction in roots]
-    # near a double root its value's rounding moves it: 1e-16 over the slope
+    # Near a double root, rounding moves the root by 1e-16 over the slope.
     assert_close([t for t, _ in roots_found], [t for t, _ in roots], 2e-12)
 
 
@@ -214,7 +214,7 @@ def test_distant_events_cost_no_evaluations(formulation: str, either_terms: str)
     far = [{"coordinate": "theta_2", "value": 50.0}, {"coordinate": "theta_1", "of": "q_dot", "value": 1e3}]
     observed = simulate("five_bar/swing", {**overrides, "event": far}, profile=True)
     assert observed.events == []
-    placed = {"pinocchio": "J", "generated": "phi"}[either_terms]  # written out, phi comes with J
+    placed = {"pinocchio": "J", "generated": "phi"}[either_terms]  # compiled terms compute phi together with J
     assert observed.profile[placed]["calls"] < 1.1 * plain.profile[placed]["calls"]
 
 

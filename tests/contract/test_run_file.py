@@ -146,7 +146,7 @@ def test_column_index_by_name(tracked: Run) -> None:
         tracked.column("theta_9")
 
 
-# --- written whole or not at all -------------------------------------------------------------------
+# --- atomic writes ---------------------------------------------------------------------------------
 
 
 def test_failed_write_keeps_the_old_file(tracked: Run, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ def test_sampled_control_agrees_with_numpy(scene: str, period: float, delay: flo
     assert_close(run.t[rows], instants, 1e-12)
     assert_close(run.q_tree[rows][:, Q], states[:, :2], 1e-9)
     assert_close(run.v_tree[rows][:, Q], states[:, 2:], 1e-7)
-    # what acts, at every output instant: u is continued from the right
+    # u at output instants is its limit from the right
     newest = np.searchsorted(instants, run.t + 1e-9) - 1
     assert_close(run.u, acts[newest], 1e-6)
     assert np.array_equal(run.u, run.tau)
@@ -111,7 +111,7 @@ def test_a_sampled_controller_from_python() -> None:
     assert inner is not None
     sampled = Sampled(inner, 5e-4, 2e-4)
     shipped = simulate("five_bar/tracking", {**overrides, "controller.sample_time": 5e-4, "controller.delay": 2e-4})
-    for _ in range(2):  # a run leaves nothing behind
+    for _ in range(2):  # a second run gives the same
         run = simulate("five_bar/tracking", overrides, controller=sampled)
         assert_close(run.q_tree, shipped.q_tree, 1e-9)
         assert_close(run.u, shipped.u, 1e-6)

@@ -65,7 +65,7 @@ def test_steps_off_the_manifold_agree_with_the_run() -> None:
             assert_close(state.q_tree, run.q_tree[k], 1e-8)
             assert_close(state.v_tree, run.v_tree[k], 1e-6)
             assert_close(state.w, run.w[k], 1e-12)
-            if k == 5:  # and so it is from a state in the middle
+            if k == 5:  # also from an intermediate state
                 simulator.reset(state)
         assert simulator.state.t == pytest.approx(0.1, abs=1e-12)
 
@@ -135,7 +135,7 @@ def test_steps_cross_rank_loss_like_the_run(u: Array | None) -> None:
         assert_close(state.q_tree, run.q_tree[k], 1e-6)
         assert_close(state.q, run.q_tree[k][[0, 2]], 1e-6)
     assert_close(state.terms.energy, run.energy[0], 1e-7)
-    assert_close(simulator.step(np.ones(2), 1e-3).q, state.q, 0.1)  # the user's own q again
+    assert_close(simulator.step(np.ones(2), 1e-3).q, state.q, 0.1)  # in the user's coordinates again
 
 
 def test_exhausted_budget_raises_numerical_error() -> None:
@@ -151,7 +151,7 @@ def test_step_costs_one_extra_evaluation() -> None:
     """A step with constant u needs one evaluation more than the method."""
     scene = load_scene("five_bar/swing", {"formulation": "reduced"})
     simulator = Simulator(scene)
-    for _ in range(3):  # until the method has found its length
+    for _ in range(3):  # until the method has its step size
         simulator.step(None, 0.002)
     before = simulator.stats["rhs"]
     for _ in range(20):

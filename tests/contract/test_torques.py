@@ -120,14 +120,14 @@ def test_steps_with_tau_agree_with_scipy(geared: Path, formulation: str) -> None
     state, rng = simulator.state, np.random.default_rng(4)
     y = np.concatenate([state.q, state.q_dot])
     for k in range(12):
-        tau = rng.uniform(-1, 1, 2) * [0.02, 0.3]  # the belt's is limited
+        tau = rng.uniform(-1, 1, 2) * [0.02, 0.3]  # the belt's torque is limited
         arguments: Any = dict(zip(("left", "belt"), tau, strict=True)) if k % 3 else tau
         if k == 5:
             arguments, tau[0] = {"belt": tau[1]}, 0.0
         state = simulator.step(tau=arguments, dt=0.01)
         y = motion(y, np.array([0.0, 0.01]), lambda t, q_tree, q_dot, tau=tau: tau)[-1]
         assert_close(np.concatenate([state.q, state.q_dot]), y, 1e-9)
-    u = np.array([0.1, -0.2])  # and then a force on q
+    u = np.array([0.1, -0.2])  # then a force on q
     assert_close(simulator.step(u, 0.01).t, 0.13, 1e-12)
     assert simulator.stats["python_calls"] == 0
 
@@ -172,7 +172,7 @@ def csv(folder: Path, values: Array) -> None:
 @pytest.mark.parametrize("interpolation", ["hold", "linear"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_torques_from_a_file_agree_with_scipy(geared: Path, formulation: str, interpolation: str) -> None:
-    values = VALUES if interpolation == "hold" else 0.3 * VALUES  # on a line a limit would be met in between
+    values = VALUES if interpolation == "hold" else 0.3 * VALUES  # between rows a line could exceed a limit
     csv(geared, values)
     overrides = {
         "formulation": formulation,
@@ -189,13 +189,13 @@ def test_torques_from_a_file_agree_with_scipy(geared: Path, formulation: str, in
         k = 1 if t < 0.05 - 1e-12 else 2 if t < 0.11 - 1e-12 else 3
         return np.asarray(values[k])
 
-    before = 1e-10 if interpolation == "hold" else 0.0  # the reference's steps end where it changes
+    before = 1e-10 if interpolation == "hold" else 0.0  # the reference's steps end where the torque changes
     states = motion(start_of(run), run.t, lambda t, *state: tau(t - before, *state))
     assert_close(run.q_tree[:, Q], states[:, :2], 1e-9)
     assert_close(run.v_tree[:, Q], states[:, 2:], 1e-8)
     limits = [np.inf, 0.2]
     expected = np.array([np.clip(tau(t, Q, Q), np.negative(limits), limits) for t in run.t])
-    rows = slice(0, -1) if interpolation == "hold" else slice(None)  # at the end the last row begins
+    rows = slice(0, -1) if interpolation == "hold" else slice(None)  # the last row starts at the end
     assert_close(run.tau[rows], expected[rows], 1e-12)
     assert run.stats["python_calls"] == 0
     kept = Run.load(run.save(geared / "run.npz"))

@@ -18,7 +18,7 @@ def steps_of(loop: Any, begin: Callable[[], None], t_end: float) -> Array:
     begin()
     ends: list[float] = []
     while not ends or ends[-1] < t_end:
-        assert loop.advance(t_end, True, 0.0, math.inf)[0] in ("pause", "end")
+        assert loop.advance(until=t_end, final=True, pause=0.0, budget=math.inf)[0] in ("pause", "end")
         if not ends or loop.t > ends[-1]:
             ends.append(loop.t)
     return np.array(ends)

@@ -19,7 +19,7 @@ from tests.regression.reference import trajectory
 
 T_END = 0.5
 START = FIVE_BAR.equilibrium()[Q] + 0.5
-SHORTEST = 1e-5  # s: in a shorter step the rounding of q over the step shows in the interpolated rates
+SHORTEST = 1e-5  # s; in shorter steps the rounding of q, divided by the step size, dominates the interpolated rates
 
 Exact = Callable[[float], Array]
 formulations = pytest.mark.parametrize("formulation", ["reduced", "dae"])
@@ -58,7 +58,7 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
         rows = np.empty((len(times) + 1, ready.loop.width))
         ready.begin()
         ready.loop.record(times, rows)
-        assert ready.loop.advance(T_END, True, math.inf, math.inf)[0] == "end"
+        assert ready.loop.advance(until=T_END, final=True, pause=math.inf, budget=math.inf)[0] == "end"
         largest.append(np.max([error(row[0], row[1:5], row[5:9]) for row in rows[: len(times)]], axis=0))
     return largest[0], largest[1]
 

@@ -19,13 +19,13 @@ from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
 from tests.convergence.steps import steps_of
 
-T_END = 0.5  # s, and steps by powers of two, so that they add up without rounding
+T_END = 0.5  # s; step sizes are powers of two, so that they add up without rounding
 START, RATE = FIVE_BAR.equilibrium()[Q], np.array([1.0, 1.0])
-EPSILON = 0.2  # s: slow, so that explicit methods show their order on eq. 8 too
-W = np.array([0.03, 0.0])  # a base longer by that much
-OFF_MANIFOLD = {"reduced": False, "dae": False, "eq. 17": True, "eq. 8": True}  # formulations, whether off the manifold
+EPSILON = 0.2  # s; large, so that explicit methods have their order on eq. 8 too
+W = np.array([0.03, 0.0])  # phi of a base that is longer by this
+OFF_MANIFOLD = {"reduced": False, "dae": False, "eq. 17": True, "eq. 8": True}  # whether the start is off the manifold
 
-# name, an rtol that chooses the number of stages, its order, that of its output between steps (at least), steps
+# name, rtol that selects the number of stages, order, lowest order of the output between steps, steps
 METHODS = {
     "RK45": ("RK45", 0.1, 5, 4, 16),
     "DOP853": ("DOP853", 0.1, 8, 7, 8),
@@ -34,7 +34,7 @@ METHODS = {
     "Radau, 7 stages": ("Radau", 1e-8, 13, 7, 4),
 }
 
-ROUNDING = 3e-13  # rad, rad / s: of loops closed to 1e-13
+ROUNDING = 3e-13  # rad, rad/s; error of loops closed to 1e-13
 
 Exact = Callable[[float], Array]
 
@@ -74,7 +74,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
 
     def begin() -> None:
         ready.begin()
-        ready.loop.length = h  # instead of the short one it would begin with
+        ready.loop.length = h  # instead of a short first step
 
     ends = steps_of(ready.loop, begin, T_END)
     assert ends == pytest.approx(h * np.arange(1, steps + 1), rel=1e-12)
@@ -84,7 +84,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
         rows = np.empty((len(times) + 1, ready.loop.width))
         begin()
         ready.loop.record(times, rows)
-        assert ready.loop.advance(T_END, True, math.inf, math.inf)[0] == "end"
+        assert ready.loop.advance(until=T_END, final=True, pause=math.inf, budget=math.inf)[0] == "end"
         largest.append(max(np.abs(row[[1, 3, 5, 7]] - exact(row[0])).max() for row in rows[: len(times)]))
     return largest[0], largest[1]
 

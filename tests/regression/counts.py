@@ -1,7 +1,7 @@
-"""What fixed runs evaluate; `python -m tests.regression.counts` writes data/counts.json anew.
+"""Numbers of evaluations of fixed runs; `python -m tests.regression.counts` records them in data/counts.json.
 
-To be done when a change is meant to change them, and to be looked at then: fewer, or more for a reason. The runs are
-ones whose counts rounding does not change: between machines, or by 1e-9 of atol.
+Record them when a change is meant to change them, and review the difference: fewer, or more for a reason. The counts of
+these runs do not depend on rounding: they are equal on different machines and for atol changed by 1e-9.
 """
 
 from __future__ import annotations

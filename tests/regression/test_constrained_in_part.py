@@ -49,14 +49,14 @@ def test_spinning_top_conserves_energy_and_vertical_angular_momentum(top: Path) 
     run = simulate(top / "default.scene.toml", {"solver.rtol": 1e-10, "initial.q_dot": spin})
     assert run.status == "done"
     assert_close(run.energy, run.energy[0], 1e-7)
-    # inertia about the pivot times the angular velocity in the body's axes, turned to the world
+    # inertia about the pivot times the angular velocity in body axes, rotated to the world
     inertia = np.diag([0.01, 0.03, 0.04])
     vertical = []
     for row, v in zip(run.q_tree, run.v_tree, strict=True):
         rotation = _rotation(row[3:])
         vertical.append(float((rotation @ inertia @ v[3:])[2]))
     assert np.ptp(vertical) < 1e-7
-    assert np.ptp(run.v_tree[:, 3]) > 1e-3  # it does not just spin
+    assert np.ptp(run.v_tree[:, 3]) > 1e-3  # not a pure spin
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from tests.regression.reference import FORMULATIONS, Trajectory, trajectory
 formulations = pytest.mark.parametrize("formulation", FORMULATIONS)
 
 
-TIGHT = 1e-10  # keeps the errors, which are of the size of rtol, below those of `assert_follows`
+TIGHT = 1e-10  # so that errors stay below the tolerance of `assert_follows`
 
 
 def assert_follows(ours: Run, reference: Trajectory) -> None:

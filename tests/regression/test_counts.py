@@ -68,7 +68,7 @@ def test_epsilon_hardly_changes_the_cost_off_the_manifold(run: Callable[..., Run
         assert off.stats["newton"] <= 1.5 * off.stats["rhs"]
 
 
-# right-hand sides hardly depend on it, so that these are Newton corrections for what z is predicted from
+# The number of right-hand sides hardly depends on it, so these are Newton corrections due to the initial guess of z.
 @pytest.mark.parametrize("scene", ["andrews", "delta", "stewart", "talos"])
 def test_number_of_newton_corrections_is_bounded(run: Callable[..., Run], scene: str) -> None:
     ours = run(scene, formulation="reduced", t_end=0.05, solver__output_dt=0.005)

@@ -21,7 +21,7 @@ from scripts.experiments.benchmark.peers.ida import Stabilised
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.regression.reference import trajectory
 
-# --- IDA, independent of every step of ours ---------------------------------------------------------
+# --- IDA, an independent integrator ------------------------------------------------------------------
 
 
 def ida(scene: str, overrides: dict[str, Any], rtol: float, times: Array) -> tuple[Array, Array]:
@@ -73,7 +73,7 @@ def test_baumgarte_damps_drift_and_projection_removes_it(run: Callable[..., Run]
     drift = np.abs(free.phi).max(axis=1)
     assert drift[-100:].max() > 3 * drift[:100].max() > 0  # it grows
     assert free.max_phi > 50 * damped.max_phi
-    assert damped.max_phi > 1e3 * projected.max_phi  # what is off decays, while every step adds to it
+    assert damped.max_phi > 1e3 * projected.max_phi  # the residual decays, while each step adds to it
     assert projected.max_phi <= 1e-12
 
 
@@ -84,7 +84,7 @@ def test_baumgarte_residual_decays_critically_damped() -> None:
     q_tree = ready.start.at.q_tree + np.array([1e-4, 0.0, 0.0, 0.0])
     at = ready.mechanism.kinematics(q_tree)
     ready.begin(Start(at, np.zeros(2), np.zeros(2), np.zeros(4)))
-    assert ready.loop.advance(0.3, True, math.inf, math.inf)[0] == "end"
+    assert ready.loop.advance(until=0.3, final=True, pause=math.inf, budget=math.inf)[0] == "end"
     decayed = at.phi * (1 + 5.0 * 0.3) * np.exp(-5.0 * 0.3)
     np.testing.assert_allclose(FIVE_BAR.phi(ready.loop.y[:4]), decayed, rtol=0, atol=1e-9)
 
@@ -93,7 +93,7 @@ def test_baumgarte_residual_decays_critically_damped() -> None:
     ("overrides", "said"),
     [
         ({"formulation": "spf", "solver.baumgarte": [1.0, 1.0]}, 'baumgarte is for formulation = "dae"'),
-        ({"formulation": "dae", "solver.baumgarte": [1.0, 1.0]}, "give projection = false"),
+        ({"formulation": "dae", "solver.baumgarte": [1.0, 1.0]}, "give solver.projection = false"),
         ({"formulation": "dae", "solver.projection": False, "solver.baumgarte": [1.0]}, "baumgarte"),
         ({"formulation": "dae", "solver.projection": False, "solver.baumgarte": [1.0, -1.0]}, "baumgarte"),
     ],

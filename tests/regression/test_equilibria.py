@@ -32,7 +32,7 @@ def test_equilibrium_search_converges_from_far_configurations(
     at = stable_equilibrium(model)
     assert len(tried) <= trials
     assert np.abs(at.phi).max(initial=0.0) <= model.tolerance
-    # nothing near it is lower, by Pinocchio's own energy
+    # By Pinocchio's energy, no configuration in the neighbourhood is lower.
     tree, random = model.tree, np.random.default_rng(0)
     lowest = Terms(model, at, np.zeros(model.n)).potential_energy
     best = model.choose_partition(at)

@@ -24,9 +24,9 @@ CONTROLLED = [
     for scene in list_scene_names(mechanism)
     if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
 ]
-T_END = {"andrews": 0.01}  # s; open loop, what is off grows by e in 2 ms there, and rounding differs by machine
-AT_REST = 1e-12  # of the fastest coordinate: rounding of a rate that is zero, as at a turn
-ROUNDED = 1e-9  # of the largest row of J: a row of zeros
+T_END = {"andrews": 0.01}  # s; open-loop errors grow by e in 2 ms there, and rounding differs between machines
+AT_REST = 1e-12  # relative to the fastest coordinate; rounding of a rate that is zero, as at a reversal
+ROUNDED = 1e-9  # relative to the largest row of J; smaller rows count as zero
 
 
 def waves(mechanism: Mechanism, t_end: float, size: float = 0.05) -> dict[str, Any]:

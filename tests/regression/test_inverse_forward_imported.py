@@ -18,13 +18,13 @@ from tests.regression.test_inverse_forward import assert_gives_back, assert_inte
 
 SCENE = 'mechanism = "mechanism.toml"\nformulation = "reduced"\nt_end = 0.1\ninitial.at = "assembled"\n'
 HINGE = "<equality><connect site1='s1' site2='t1'/><connect site1='s2' site2='t2'/></equality>"
-# floats, with two arms that motors turn
+# a floating body with two motor-driven arms
 ARM = "<body><joint name='{0}' axis='0 1 0'/><geom type='capsule' fromto='{1} 0 0 {2} 0 .3' size='.03'/></body>"
 FLOATING = (
     "<body><freejoint/><geom type='box' size='.2 .1 .1'/>"
     f"{ARM.format('left', -0.2, -0.4)}{ARM.format('right', 0.2, 0.4)}</body>"
 )
-# a crank that rubs, has a rotor and a gear; a rod on a spring
+# a crank with friction, rotor and gear; a rod on a spring
 RUBBING = TWO_ARMS.replace('<joint name="a"', '<joint name="a" frictionloss=".3" damping=".2" armature=".05"').replace(
     '<joint name="b"', '<joint name="b" stiffness="4" springref=".3"'
 )
@@ -59,7 +59,7 @@ def robot(file: str) -> Draft:
     return read(resolve_path(f"package://example-robot-data/robots/{file}", Path(), "test"))
 
 
-def written(draft: Draft, folder: Path) -> Path:
+def write_with_scene(draft: Draft, folder: Path) -> Path:
     write(draft, folder)
     scene = folder / "default.scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
@@ -67,7 +67,7 @@ def written(draft: Draft, folder: Path) -> Path:
 
 
 def assert_swings_as_it_should(draft: Draft, folder: Path) -> None:
-    scene = written(draft, folder)
+    scene = write_with_scene(draft, folder)
     overrides = waves(load(folder / "mechanism.toml"), 0.1)
     forces = inverse_dynamics(scene, overrides)
     assert forces.status == "done"
@@ -96,13 +96,13 @@ def test_published_robots_are_moved_along_all_driven_freedoms(tmp_path: Path) ->
 
 
 def test_freedom_without_motor_is_named(tmp_path: Path) -> None:
-    scene = written(imported(tmp_path, legs(), YAML), tmp_path / "written")
+    scene = write_with_scene(imported(tmp_path, legs(), YAML), tmp_path / "written")
     with pytest.raises(InputError, match=r"a_hip cannot drive every freedom; the motion along b_knee is driven by"):
         inverse_dynamics(scene, waves(load(tmp_path / "written" / "mechanism.toml"), 0.1))
 
 
 def test_massless_fingers_are_rejected(tmp_path: Path) -> None:
     """Romeo's fingers and the links geared to them have no mass, so torques do not determine their accelerations."""
-    scene = written(robot("romeo_description/urdf/romeo.urdf"), tmp_path)
+    scene = write_with_scene(robot("romeo_description/urdf/romeo.urdf"), tmp_path)
     with pytest.raises((InputError, MechanismError), match="mass"):
         simulate(scene, waves(load(tmp_path / "mechanism.toml"), 0.1))

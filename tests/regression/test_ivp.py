@@ -59,12 +59,12 @@ def test_run_agrees_with_its_equations_integrated_by_scipy(scene, overrides):
     for t, y in zip(times, solution.y.T, strict=True):
         row, terms = int(np.searchsorted(run.t, t)), problem.terms(t, y)
         expected = problem.mechanism.tree.to_coordinates(terms.q_tree)
-        _near(run.q_tree[row], expected)
-        _near(run.v_tree[row], problem.velocity(t, y))
-        _near(run.phi[row], terms.phi)
+        assert_within_global_error(run.q_tree[row], expected)
+        assert_within_global_error(run.v_tree[row], problem.velocity(t, y))
+        assert_within_global_error(run.phi[row], terms.phi)
 
 
-def _near(solution, expected):
+def assert_within_global_error(solution, expected):
     """The global error of a run stays within a hundred times the tolerance of a step."""
     assert np.abs(solution - expected).max() <= 100 * 1e-8 * max(1.0, np.abs(expected).max())
 
@@ -75,7 +75,7 @@ def test_as_ivp_rejects_a_sampled_controller():
 
 
 def test_overrides_need_a_name():
-    with pytest.raises(InputError, match="a Scene is complete"):
+    with pytest.raises(InputError, match="accepted only with the name"):
         as_ivp(load_scene("five_bar/swing"), {"t_end": 1.0})
 
 

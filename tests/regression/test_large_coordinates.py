@@ -9,7 +9,7 @@ import ckc_pin
 
 TURNS = (100, 1000, 10_000)
 FORMULATIONS = ("dae", "reduced", "spf")
-# A four-bar on a body that is free, all of it in the plane z = 0; it falls as a whole and turns.
+# A four-bar on a free body in the plane z = 0, which falls and rotates.
 URDF = """<robot name="falling"><link name="world"/>
 <joint name="root" type="floating"><parent link="world"/><child link="base"/></joint>
 {links}
@@ -68,7 +68,7 @@ def test_motion_does_not_depend_on_initial_turns(turns: int, formulation: str) -
     q = dict(zip(expected.coordinates, expected.q_tree[0], strict=True)) | {"crank": at + more}
     turned = ckc_pin.simulate("four_bar/turning", overrides | {"initial": {"q": q, "q_dot": {"crank": 12.0}}})
     assert turned.status == "done", turned.message
-    rounded = 1e-5 * turns / TURNS[-1]  # what an angle of so many turns is rounded to, magnified by the motion
+    rounded = 1e-5 * turns / TURNS[-1]  # rounding of an angle of so many turns, amplified by the motion
     assert abs(turned["crank"][-1] - more - expected["crank"][-1]) < 1e-6 + rounded
     assert abs(turned["rocker"][-1] - expected["rocker"][-1]) < 1e-6 + rounded
 

@@ -20,7 +20,7 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "sampled": ("five_bar/tracking", {"controller.sample_time": 2e-3, "controller.delay": 5e-3}),
     "across type 2": ("five_bar/swing", {"formulation": "dae", "initial.q_dot": {"theta_1": 6.0, "theta_3": -6.0}}),
 }
-ALLOWED = 50  # bytes a step: the smallest array, kept at each, takes 130
+ALLOWED = 50  # bytes per step; the smallest array, stored at each step, takes 130
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -31,12 +31,13 @@ def test_memory_does_not_grow_with_steps(name: str) -> None:
     ready.begin()
     rows = np.empty((2, ready.loop.width))
     ready.loop.record(np.array([ready.scene.spec.t_end]), rows)
-    sizes, count = np.zeros(1000), 0  # made before, so that looking keeps nothing itself
+    sizes, count = np.zeros(1000), 0  # allocated before, so that measuring needs no memory
     gc.collect()
-    gc.freeze()  # what other tests have left need not be looked through each time
+    gc.freeze()  # so that objects of other tests are not examined each time
     tracemalloc.start()
     try:
-        while ready.loop.advance(ready.scene.spec.t_end, True, 0.0, 60.0)[0] == "pause":  # after every step
+        # A pause of zero returns after each step.
+        while ready.loop.advance(until=ready.scene.spec.t_end, final=True, pause=0.0, budget=60.0)[0] == "pause":
             if count % 20 == 0:
                 gc.collect()
                 sizes[count // 20] = tracemalloc.get_traced_memory()[0]

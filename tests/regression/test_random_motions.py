@@ -17,9 +17,9 @@ def start(q: tuple[float, ...], q_dot: tuple[float, ...], names: tuple[str, ...]
     return {"initial": {"q": dict(zip(names, q, strict=True)), "q_dot": dict(zip(names, q_dot, strict=True))}}
 
 
-# scene, formulation, rtol, overrides; the energy may be off by so many rtol of the largest kinetic energy
+# scene, formulation, rtol, overrides; largest energy error, in rtol times the largest kinetic energy
 CASES = {
-    # the last stage was on another branch, with a number that was not finite
+    # The last stage was on another branch and had a number that was not finite.
     "a chart that ends": (
         "five_bar/swing", "reduced", 1e-2,
         {**start((1.0974350852385353, 2.770016072687662), (-0.3543304420202529, -0.21339817076162462)), "t_end": 2.0},
@@ -35,7 +35,7 @@ CASES = {
             "event": [{"of": "q_dot", "coordinate": "theta_1", "value": 1.0}],
         },
     ),
-    # error control saw q and q_dot alone: the rates of z were wrong by then, and the change of chart made that last
+    # Error control used q and q_dot only. The rates of z were wrong, and the change of chart preserved the error.
     "sixty radians a second of z at a chart's end": (
         "five_bar/swing", "reduced", 1e-4,
         start((-1.049311270049265, -2.5978491246810176), (15.458185805003557, 5.071114398814352)),
@@ -44,7 +44,7 @@ CASES = {
         "five_bar/swing", "reduced", 1e-6,
         start((-1.049311270049265, -2.5978491246810176), (15.458185805003557, 5.071114398814352)),
     ),
-    # Newton's method found z on another branch, and nobody noticed
+    # Newton's method converged to another branch, which was not detected.
     "another branch of the slider-crank": (
         "slider_crank/default", "reduced", 1e-3,
         {"initial": {"at": "assembled", "q_dot": {"crank": -10.155557178717102}}},
@@ -60,12 +60,12 @@ CASES = {
             "t_end": 0.53, "solver.method": "Radau",
         },
     ),
-    # one step went to another branch; from there every step was refused
+    # One step went to another branch, from where all steps were rejected.
     "a step that began on another branch": (
         "five_bar/swing", "reduced", 2.609209975332588e-07,
         {**start((0.47501492728687644, -4.415820786937327), (0.0, 0.0)), "t_end": 0.7},
     ),
-    # z closed to a share of rtol, and its rates magnified what was left: every other step was refused, for ever
+    # z was closed to a fraction of rtol and its rates amplified the residual, so every other step was rejected.
     "steps that shrink to nothing": (
         "five_bar/swing", "reduced", 2.2e-3,
         start((1.4899101633707061, -3.037115581529414), (0.15038675698040077, -0.034662251343755134)),
@@ -129,4 +129,4 @@ def test_diverging_motion_is_not_reported_as_singular() -> None:
     assert run.status == "stopped"
     assert "runs away" in run.message
     assert "nan" not in run.message
-    assert run.stats["rhs"] < 10_000_000  # what is left of the run would take 1e9 and more
+    assert run.stats["rhs"] < 10_000_000  # the rest of the run would take more than 1e9

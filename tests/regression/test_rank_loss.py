@@ -51,7 +51,7 @@ def test_run_may_end_before_at_or_after_a_crossing(t_end: float) -> None:
 def test_run_far_from_a_crossing_costs_no_extra_evaluations(rtol: float, rhs: int) -> None:
     """The first crossing is at 0.7085 s, of four squares at 0.7179 s. Counts are those without the rank monitor."""
     for N in (1, 4):
-        assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # of the interpolant
+        assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # for the interpolant
 
 
 def test_coarse_run_is_repeated_when_crossings_were_missed() -> None:
@@ -84,7 +84,7 @@ def test_formulations_that_cannot_cross_rank_loss_stop(N: int, formulation: str,
     run = n_four_bar(N, rtol, formulation=formulation)
     assert run.status == "stopped"
     assert "J loses rank" in run.message or "phi_z is singular" in run.message
-    assert run.t[-1] < 0.72  # where the row is flat first
+    assert run.t[-1] < 0.72  # where the row is flat for the first time
     end = first_top_pin(N, float(run.t[-1])) if run.t[-1] else (0.0, 1.0)
     assert run.points["B0"][-1][:2] == pytest.approx(end, abs=min(1e4 * rtol, 1e-4))
 
@@ -199,7 +199,7 @@ def test_near_miss_of_branches_is_not_a_crossing(tmp_path: Path, excess: float, 
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
 
 
-# --- what the monitor costs -----------------------------------------------------------------------
+# --- cost of the rank monitor -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", ["four_bar/turning", "five_bar/swing", "slider_crank"])

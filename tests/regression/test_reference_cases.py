@@ -47,7 +47,7 @@ def test_andrews_squeezer(formulation: str) -> None:
     q = dict(zip(run_json["coordinates"], run_json["q_tree"], strict=True))
     assert set(q) == set(ANDREWS)
     for name, expected in ANDREWS.items():
-        assert abs(q[name] - expected) <= 1e-8, name  # asked for: 1e-7
+        assert abs(q[name] - expected) <= 1e-8, name  # the test set asks for 1e-7
 
 
 # --- Bricard's mechanism -------------------------------------------------------------------------
@@ -157,7 +157,7 @@ WHEEL = """<link name="wheel"><inertial><mass value="1"/>
     <inertia ixx="0.5" iyy="0.5" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="wheel_turn" type="continuous"><parent link="world_pin"/><child link="wheel"/><axis xyz="0 0 1"/></joint>
 """
-# A point mass that two slides let move in the plane, held at 1 m from the origin.
+# A point mass on two slides in the plane, with a distance loop of 1 m to the origin.
 CARRIAGE = """<robot name="carriage">
   <link name="world_pin"/>
   <link name="bridge"/>
@@ -220,7 +220,7 @@ frame_a = "world"
 frame_b = "mass"
 length = 1.0
 """
-    # x is no chart where the mass is level with the pin, so it starts a little below, as the whole swing does
+    # x is no chart where the mass is level with the pin, so it starts slightly below.
     start = -0.3
     run = period(tmp_path, CARRIAGE, loop, f"x = {np.cos(start)}\ny = {np.sin(start)}", "x", -1, "dae")
     assert run.t[-1] == pytest.approx(one_freedom.pendulum_period(start), abs=1e-9)

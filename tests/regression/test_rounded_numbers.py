@@ -14,7 +14,7 @@ from ckc_pin.mechanism.rank import choose_dependent, redundant_rows
 from tests.conftest import assert_close
 from tests.regression.test_inverse_forward import assert_integrates_back, waves
 
-# Bennett's linkage: opposite links alike, a / sin(alpha) = b / sin(beta); of its five rows two are independent
+# Bennett's linkage: opposite links are equal, a / sin(alpha) = b / sin(beta); two of its five rows are independent.
 A, ALPHA, BETA = 0.6, 0.4, 1.1
 B = A * sin(BETA) / sin(ALPHA)
 GUESS = (0.7, -3.33, -0.73)

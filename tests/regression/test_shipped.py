@@ -14,10 +14,10 @@ from ckc_pin.dynamics import Terms, h_gradient, stable_equilibrium
 from ckc_pin.mechanism.library import library, shipped
 from ckc_pin.scene.scene import list_catalogue, list_scene_names
 
-# coordinates, freedoms, closure rows, rank: what the literature, or counting, says
+# coordinates, freedoms, closure rows, rank, from the literature or by counting
 MOBILITY = {
     "andrews": (7, 1, 6, 6),
-    "bricard": (5, 1, 5, 4),  # overconstrained: counting rows would leave none
+    "bricard": (5, 1, 5, 4),  # overconstrained: counting rows would give no freedom
     "delta": (21, 3, 18, 18),
     "five_bar": (4, 2, 2, 2),
     "five_bar_as_printed": (4, 2, 2, 2),
@@ -31,7 +31,7 @@ MOBILITY = {
     "three_rrr": (7, 3, 4, 4),
     "two_ur5": (18, 6, 12, 12),
 }
-# mechanisms that nothing damps or drives, and how long a run of the test is (s)
+# mechanisms without damping and motors, and the duration of the test's run (s)
 FREE = {
     "andrews": 0.03,
     "bricard": 5.0,
@@ -120,7 +120,7 @@ def test_energy_is_conserved_without_control(name: str, formulation: str) -> Non
     assert run.status == "done", run.message
     assert drift(run) <= (1e-7 if name == "bricard" else 3e-8)  # Bricard's phi_z comes nearest to singular
     assert run.max_phi <= 1e-10
-    assert np.ptp(run.q_tree, axis=0).max() > 0.01  # it did move
+    assert np.ptp(run.q_tree, axis=0).max() > 0.01  # the mechanism has moved
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])
@@ -138,7 +138,7 @@ def test_talos_energy_equals_work_of_dampers_and_friction(formulation: str) -> N
 
 # --- equilibria ----------------------------------------------------------------------------------
 
-# where gravity and springs leave a mechanism, by symmetry; q_guess of both slider-cranks is balanced upright
+# Equilibria under gravity and springs, by symmetry. q_guess of both slider-cranks is balanced upright.
 RESTS = {
     "bricard": {"hinge_1": np.pi / 2},
     "slider_crank": {"crank": 3 * np.pi / 2},
@@ -237,12 +237,12 @@ def test_redundant_loop_types_give_the_same_motion(tmp_path: Path, loop: str, ro
     assert_same_motion(tmp_path)
 
 
-# --- what a formulation cannot do is refused, not computed ----------------------------------------
+# --- unsupported combinations are rejected --------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["delta", "stewart", "talos", "two_ur5"])
-def test_eq_8_as_printed_is_refused_with_a_free_root(name: str) -> None:
-    with pytest.raises(InputError, match='rotation of a free root is none; take "w"'):
+def test_eq_8_as_printed_is_rejected_with_a_free_root(name: str) -> None:
+    with pytest.raises(InputError, match="rotation of a free root has no such numbers"):
         simulate(name, {"formulation": "spf", "spf_coordinates": "z", "t_end": 0.01})
     assert simulate(name, {"formulation": "spf", "t_end": 0.01}).status == "done"
 
@@ -253,7 +253,7 @@ def test_contradictory_w_of_redundant_rows_is_rejected() -> None:
     with pytest.raises(InputError, match=r"no configuration has phi = w.*follow from others \(hinge_4"):
         simulate("bricard", {**overrides, "initial.w": [1e-3] * 5})
     bricard, moves = mechanism("bricard"), np.array([1e-3, 0.0, 2e-3, 1e-3, 0.0])
-    moves[bricard.partition.q] = 0.0  # the start's own
+    moves[bricard.partition.q] = 0.0  # keep q of the start
     off = bricard.assembled.integrate(moves)
     assert np.abs(off.phi).max() > 1e-4
     run = simulate("bricard", {**overrides, "initial.w": off.phi.tolist()})

@@ -30,7 +30,7 @@ def test_eq_8_as_printed_agrees_with_eq_17(run: Callable[..., Run], epsilon: flo
     """Rates agree too, because z_dot uses the exact w; the error of phi would be divided by epsilon."""
     printed, levels = eq_8(run, epsilon, w), eq_17(run, epsilon, w)
     assert printed.stats["method"] == "Radau"
-    assert printed.stats["newton"] == 0  # no sigma anywhere: z is integrated
+    assert printed.stats["newton"] == 0  # z is integrated, so sigma is never evaluated
     assert_close(printed.q_tree, levels.q_tree, 1e-8)
     assert_close(printed.v_tree, levels.v_tree, 1e-7)
 
@@ -47,7 +47,7 @@ def test_eq_8_as_printed_works_for_any_epsilon(run: Callable[..., Run], w: list[
         assert printed.status == "done"
         assert printed.max_phi <= 1e-8
         assert_close(printed.q_tree, levels.q_tree, 2e-7)
-        assert_close(printed.v_tree[1:], levels.v_tree[1:], 2e-6)  # at the start it is of the size of w / epsilon
+        assert_close(printed.v_tree[1:], levels.v_tree[1:], 2e-6)  # at the start the rate has the size of w / epsilon
     assert max(counts) <= 1_000
 
 

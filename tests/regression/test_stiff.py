@@ -30,7 +30,7 @@ def exact() -> Callable[[float], Array]:
     return solve_ivp(rhs, (0, 9.5), start, method="LSODA", rtol=1e-13, atol=1e-15, dense_output=True).sol
 
 
-# rtol, and the right-hand sides that it may take
+# rtol, largest number of right-hand sides
 BUDGETS = {1e-4: 940, 1e-6: 950, 1e-8: 1_600, 1e-9: 1_850, 1e-10: 2_000}
 
 
@@ -85,7 +85,7 @@ def test_callers_controller_costs_as_many_right_hand_sides() -> None:
 TARGET = FIVE_BAR.equilibrium()[Q] + [0.2, 0.1]
 
 
-# modes in 1/s and the end in s
+# modes in 1/s, end time in s
 MODES = {
     "a slow oscillation": ([-0.1 + 3j, -0.1 - 3j], 10.0, False),
     "a fast oscillation, undamped": ([1e4j, -1e4j, 1j, -1j], 10.0, False),

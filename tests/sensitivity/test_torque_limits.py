@@ -77,4 +77,4 @@ def test_a_torque_pole_has_no_derivative() -> None:
     result = sensitivities(scene, ["motor.mot_a1.torque_limit"])
     assert result.run.status == "stopped"
     assert result.run.t[-1] == pytest.approx(0.7218, abs=1e-3)
-    assert "what is wanted of the motors passes through infinity, and they jump from limit" in result.run.message
+    assert "the required motor torque passes through infinity and jumps from one limit" in result.run.message
