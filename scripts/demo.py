@@ -1,4 +1,4 @@
-"""The paper's five-bar under both controllers, each as the SPF and as the reduced model: runs, figures, a table."""
+"""Demo: run the paper's five-bar under both controllers as SPF and reduced model; write figures and print a table."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from ckc_pin.view.figures import plot_runs
 
 ROOT = Path(__file__).resolve().parent.parent
 CASES = ("set_point", "tracking")
-# The SPF as the paper prints it, eq. 8: from w(0) = 0 eq. 17's coordinates would compute the reduced model again.
+# The SPF is eq. 8 as printed: from w(0) = 0, the coordinates of eq. 17 would compute the reduced model again.
 FORMULATIONS = {"spf": {"formulation": "spf", "spf_coordinates": "z"}, "reduced": {"formulation": "reduced"}}
-STEADY = 4.0  # s: from here on tracking is in its steady state
-BOUND, BOUND_STEADY = 30.0, 5.0  # |u| in the paper's tracking, N m: at first, in steady state
+STEADY = 4.0  # s: time from which tracking is in steady state
+BOUND, BOUND_STEADY = 30.0, 5.0  # N m: the paper's bounds of |u| in tracking, at first and in steady state
 
 
 def main() -> int:
-    """Return the exit code: 0 only if all runs are done."""
+    """Run the demo and return the exit code: 0 only if all runs are complete."""
     out = parse_arguments()
     runs: list[ckc_pin.Run] = []
     for case, formulation in product(CASES, FORMULATIONS):
@@ -45,7 +45,7 @@ def main() -> int:
         fail(f"--out {out}: {error}")
     console = Console(highlight=False)
     console.print(table(runs))
-    lines = ["Files:", *(f"  {shown(path)}" for path in files), f"Watch: {playback(out / 'tracking')}"]
+    lines = ["Files:", *(f"  {shorten_path(path)}" for path in files), f"Watch: {playback(out / 'tracking')}"]
     console.print(*lines, sep="\n", markup=False, soft_wrap=True)
     for run in runs:
         if run.status != "done":
@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def parse_arguments() -> Path:
-    """Return the folder to write to."""
+    """Return the output folder from the command line."""
     parser = argparse.ArgumentParser(prog="demo", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "demo", metavar="DIR", help="folder for runs and figures")
     out: Path = parser.parse_args().out
@@ -66,7 +66,7 @@ def parse_arguments() -> Path:
 
 
 def simulate(scene: str, formulation: str) -> ckc_pin.Run:
-    """Run a scene, with a bar on a terminal."""
+    """Run a scene, with a progress bar on a terminal."""
     errors = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("t = {task.completed:.2f} s"))
     with Progress(*columns, TimeRemainingColumn(), console=errors, disable=not errors.is_terminal) as bar:
@@ -79,11 +79,13 @@ def simulate(scene: str, formulation: str) -> ckc_pin.Run:
 
 
 def table(runs: list[ckc_pin.Run]) -> Table:
-    """What was computed, a line for each run."""
-    found = Table(title="The paper's five-bar", box=box.SIMPLE_HEAD, padding=(0, 0), caption_justify="left")
-    found.caption = f"The paper's bounds in tracking: |u| <= {BOUND:g} N m, after {STEADY:g} s <= {BOUND_STEADY:g} N m."
-    found.add_column("\n\ncase", no_wrap=True)
-    found.add_column("\n\nmodel", no_wrap=True)
+    """Return the table of results, one row per run."""
+    results = Table(title="The paper's five-bar", box=box.SIMPLE_HEAD, padding=(0, 0), caption_justify="left")
+    results.caption = (
+        f"The paper's bounds in tracking: |u| <= {BOUND:g} N m, after {STEADY:g} s <= {BOUND_STEADY:g} N m."
+    )
+    results.add_column("\n\ncase", no_wrap=True)
+    results.add_column("\n\nmodel", no_wrap=True)
     for heading in (
         "\n\nε",
         "\n\nstatus",
@@ -94,13 +96,13 @@ def table(runs: list[ckc_pin.Run]) -> Table:
         "right-\nhand\nsides",
         "\n\ns",
     ):
-        found.add_column(heading, justify="right", no_wrap=True)
+        results.add_column(heading, justify="right", no_wrap=True)
     for run in runs:
         columns = [run.column(name) for name in run.independent]
         formulation = run.scene["formulation"]
         error = run.q_tree[-1, columns] - desired(run)
         late = np.abs(run.u[run.t >= STEADY])
-        found.add_row(
+        results.add_row(
             run.scene_name.rpartition("/")[2],
             formulation,
             f"{run.scene['epsilon']:.0e}" if formulation == "spf" else "",
@@ -112,11 +114,11 @@ def table(runs: list[ckc_pin.Run]) -> Table:
             f"{run.stats['rhs']}",
             f"{run.stats['wall_s']:.1f}",
         )
-    return found
+    return results
 
 
 def desired(run: ckc_pin.Run) -> np.ndarray:
-    """q_d at the end of a run: the target, or eq. 21."""
+    """Return q_d at the end of a run: the set point, or eq. 21."""
     controller = run.scene["controller"]
     if controller["type"] == "set_point":
         return np.array([controller["q_d"][name] for name in run.independent])
@@ -124,18 +126,20 @@ def desired(run: ckc_pin.Run) -> np.ndarray:
     return np.array([np.pi / 3 * np.sin(t), np.pi / 4 * (1 - np.cos(t))])
 
 
-def shown(path: Path) -> Path:
-    """A path as short as it can be typed."""
+def shorten_path(path: Path) -> Path:
+    """Return a path relative to the working directory if possible."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def playback(folder: Path) -> str:
-    """The command that plays a case, the SPF on the reduced model."""
-    return f"{shown(Path(sys.executable).parent / 'ckc')} play {shown(folder / 'reduced')} {shown(folder / 'spf')}"
+    """Return the command that plays SPF and reduced model together."""
+    paths = (Path(sys.executable).parent / "ckc", folder / "reduced", folder / "spf")
+    program, reduced, spf = (shorten_path(path) for path in paths)
+    return f"{program} play {reduced} {spf}"
 
 
 def fail(message: str) -> NoReturn:
-    """End with one message."""
+    """Print a message and exit with code 2."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(2)
 

@@ -1,4 +1,4 @@
-"""``./scripts/experiment NAME ...``: every experiment, each loaded when it is run."""
+"""Command line of the experiments, ``./scripts/experiment NAME ...``. Each experiment is imported when it is run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 class Listed(TyperGroup):
-    """Commands, of which a wrong name is told."""
+    """Command group that lists the experiments when a name is unknown."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args[0] not in self.commands:
@@ -26,7 +26,7 @@ class Listed(TyperGroup):
 
 
 def examples(*lines: str) -> str:
-    """Return the end of a command's help: ways to call it."""
+    """Return the examples at the end of a command's help."""
     return "\b\nExamples:\n" + "\n".join(f"  ./scripts/experiment {line}" for line in lines)
 
 
@@ -44,19 +44,25 @@ Keys = Annotated[list[str] | None, typer.Argument(metavar="KEY", show_default=Fa
 
 
 class Formulation(StrEnum):
-    """What rank_loss runs."""
+    """Formulations that rank_loss can run."""
 
     dae = "dae"
     reduced = "reduced"
     spf = "spf"
 
 
-def chosen(given: Sequence[str] | None, known: Collection[str], what: str) -> list[str]:
-    """Return the names that were given; of one that is not known say which there are."""
-    for name in given or ():
-        if name not in known:
-            raise typer.BadParameter(f"no {what} {name!r}; there are {', '.join(known)}")
-    return list(given or ())
+def check_names(names: Sequence[str] | None, choices: Collection[str], kind: str) -> list[str]:
+    """Return the names as a list.
+
+    Raises
+    ------
+    typer.BadParameter
+        A name is unknown; the message lists the choices.
+    """
+    for name in names or ():
+        if name not in choices:
+            raise typer.BadParameter(f"no {kind} {name!r}; there are {', '.join(choices)}")
+    return list(names or ())
 
 
 @app.command(epilog=examples("paper", "paper figure-3 cost --out out"))
@@ -64,13 +70,13 @@ def paper(
     keys: Keys = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="default: docs; with KEY out")] = None,
 ) -> None:
-    """The paper, statement by statement.
+    """Check the paper statement by statement.
 
-    Writes docs/paper.md with its figures and docs/errata.md; with KEY it prints these entries alone.
+    Writes docs/paper.md with its figures, and docs/errata.md. With KEY it only prints those entries.
     """
     from scripts.experiments.paper.contents import KEYS
 
-    names = chosen(keys, KEYS, "entry")
+    names = check_names(keys, KEYS, "entry")
     from scripts.experiments.paper import page
 
     if names:
@@ -84,14 +90,14 @@ def paper(
 
 @app.command(epilog=examples("errata", "errata multipliers"))
 def errata(keys: Keys = None) -> None:
-    """The paper's errata, each with its number.
+    """Compute the paper's errata, each with the number that shows it.
 
     docs/errata.md is written by `paper`.
     """
     from scripts.experiments.paper import page
     from scripts.experiments.paper.errata import ERRATA, find
 
-    print(page.errata_entries(find(chosen(keys, ERRATA, "erratum"))), end="")
+    print(page.errata_entries(find(check_names(keys, ERRATA, "erratum"))), end="")
 
 
 @app.command(epilog=examples("stability", "stability length"))
@@ -99,14 +105,14 @@ def stability(
     groups: Annotated[list[str] | None, typer.Argument(metavar="GROUP", show_default=False)] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="for page and table")] = DOCS,
 ) -> None:
-    """Integrators pushed to where they stop.
+    """Run the stability suite: every integrator up to its limits.
 
-    Writes docs/stability.md, or prints some groups; exit 1 where a cell FAILED.
+    Writes docs/stability.md, or prints the named groups. Exits with 1 if a cell FAILED.
     """
     from scripts.experiments.stability import suite
     from scripts.experiments.stability.page import as_frame, page, satisfied, save
 
-    names = chosen(groups, suite.NAMES, "group")
+    names = check_names(groups, suite.NAMES, "group")
     cells, long_runs = suite.measure(names or suite.NAMES)
     table = as_frame(cells)
     text = page(table, long_runs)
@@ -125,9 +131,9 @@ def rank_loss(
     formulation: Formulation = Formulation.dae,
     quick: Annotated[bool, typer.Option("--quick", help="N = 1, 2, 7 and every third tolerance")] = False,
 ) -> None:
-    """Positions where J loses rank, against a closed form.
+    """Cross positions where J loses rank, and compare with a closed form.
 
-    Says how many runs are right, stopped or wrong.
+    Prints how many runs are right, stopped or wrong.
     """
     from scripts.experiments import rank_loss
 
@@ -141,9 +147,9 @@ def generated_sizes(
         typer.Argument(metavar="MECHANISM", show_default=False, help="shipped name, N squares in a row, ring_n"),
     ] = None,
 ) -> None:
-    """Up to which size compiled terms pay.
+    """Measure up to which size of mechanism compiled terms pay.
 
-    Prints text, times and gain by size.
+    Prints length of the C text, times and speed-up by size.
     """
     from scripts.experiments import generated_sizes
 
@@ -156,19 +162,19 @@ def benchmark(
     out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "report",
     page: Annotated[bool, typer.Option("--page", help="measure nothing: page and figures from the tables")] = False,
 ) -> None:
-    """Error against run time, beside other programs.
+    """Measure error against run time, here and in other programs.
 
-    Writes docs/report, and goes on where it was stopped.
+    Writes docs/report. An interrupted benchmark resumes where it stopped.
     """
     from scripts.experiments.benchmark import make
 
-    for path in make.report(out, quick=quick, anew=not page):
+    for path in make.report(out, quick=quick, from_tables=page):
         print(f"written: {path}")
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
 def fuzz(context: typer.Context) -> None:
-    """Random motions, judged by an integration of its own."""
+    """Run random motions and compare them with an independent integration."""
     from scripts.experiments.fuzz import main as suite
 
     raise typer.Exit(suite.main(context.args))
@@ -176,9 +182,9 @@ def fuzz(context: typer.Context) -> None:
 
 @app.command(epilog=examples("scenes"))
 def scenes() -> None:
-    """Errors of all shipped scenes, by SciPy.
+    """Measure the errors of all shipped scenes with SciPy.
 
-    In units of their tolerance; exit 1 where one is too far off.
+    Errors are in units of the tolerance. Exits with 1 if one is too large.
     """
     from scripts.experiments import scenes
 
@@ -187,7 +193,7 @@ def scenes() -> None:
 
 @app.command("map", epilog=examples("map --cells 200"))
 def map_(cells: Annotated[int, typer.Option(min=8, help="along each axis")] = 400) -> None:
-    """How long the five-bar's singularity map takes."""
+    """Measure how long the five-bar's singularity map takes."""
     from scripts.experiments import bench_map
 
     bench_map.main(cells)
@@ -195,7 +201,7 @@ def map_(cells: Annotated[int, typer.Option(min=8, help="along each axis")] = 40
 
 @app.command(epilog=examples("stream --runs 3"))
 def stream(runs: Annotated[int, typer.Option(min=1)] = 6) -> None:
-    """Right-hand sides per second with viewers and without."""
+    """Measure right-hand sides per second with and without viewers."""
     from scripts.experiments import bench_stream
 
     bench_stream.main(runs)
@@ -206,7 +212,7 @@ def ensembles(
     out: Annotated[Path, typer.Option(metavar="DIR", help="gets the figures")] = Path("out/ensembles"),
     quick: Annotated[bool, typer.Option("--quick", help="fewer members")] = False,
 ) -> None:
-    """Two studies by ensembles: tolerances of lengths, and a basin of attraction."""
+    """Run two ensemble studies: manufacturing tolerances of lengths, and a basin of attraction."""
     from scripts.experiments import ensemble_studies
 
     ensemble_studies.main(out, quick)
@@ -214,7 +220,7 @@ def ensembles(
 
 @app.command("bench_ensembles", epilog=examples("bench_ensembles --runs 1"))
 def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of members")] = 3) -> None:
-    """Print what ensembles cost, beside MuJoCo's rollout, and what 10^9 members would on many cores."""
+    """Measure ensembles against MuJoCo's rollout, and extrapolate to 10^9 members on many cores."""
     from scripts.experiments import bench_ensembles, ensemble_scaling
 
     bench_ensembles.main(runs)
@@ -226,9 +232,9 @@ def bench_ensembles(runs: Annotated[int, typer.Option(min=1, help="thousands of 
 def bench(
     only: Annotated[str, typer.Option(metavar="WORDS", help="lines that have these words")] = "",
 ) -> None:
-    """Processor times of what a person does with a scene.
+    """Measure processor times of common calls and commands.
 
-    Exit 1 where one misses its bound.
+    Exits with 1 if one exceeds its bound.
     """
     from scripts.experiments import bench, bench_generated, bench_sensitivities
 
@@ -241,9 +247,9 @@ def bench(
 
 @app.command(epilog=examples("allocations build/count_allocations.so"))
 def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the counter, preloaded")]) -> None:
-    """Allocations of the step loop, of which a step makes none.
+    """Count allocations in the step loop; a step must make none.
 
-    Exit 1 where it does; ./scripts/check_native builds the counter and preloads it.
+    Exits with 1 if it does. ./scripts/check_native builds the counter and preloads it.
     """
     from scripts.experiments import count_allocations
 
@@ -252,7 +258,7 @@ def allocations(library: Annotated[Path, typer.Argument(exists=True, help="the c
 
 @app.command(epilog=examples("robots ~/robots"))
 def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="of checkouts")]) -> None:
-    """Import, check and motion of published robots.
+    """Import, check and move published robots.
 
     Prints the tables of docs/published_robots.md.
     """
@@ -263,14 +269,14 @@ def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, 
 
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
-    """The pictures of docs/images, by a browser."""
+    """Make the pictures of docs/images with a browser."""
     from scripts.experiments import pictures
 
     pictures.main(chromium)
 
 
 def main() -> NoReturn:
-    """Run the command line: exit 2 where the input is wrong, 3 where the numerics stopped."""
+    """Run the command line. It exits with 2 for invalid input and with 3 if the numerics stopped."""
     try:
         app(prog_name="./scripts/experiment")
     except Exception as error:

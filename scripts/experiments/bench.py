@@ -1,4 +1,7 @@
-"""Processor times of what a person does with a scene, each pair in one process, the least of several repetitions."""
+"""Benchmark of common calls and commands: processor times, the minimum of several repetitions.
+
+The two times of a ratio are measured in one process.
+"""
 
 from __future__ import annotations
 
@@ -34,23 +37,24 @@ CIRCLE = {
 }
 
 
-def least(what: Callable[[], Any], times: int) -> float:
-    """Processor time of what is called, s."""
-    return min(repeat(what, timer=process_time, repeat=times, number=1))
+def min_processor_time(function: Callable[[], Any], times: int) -> float:
+    """Return the minimum processor time of several calls of a function, s."""
+    return min(repeat(function, timer=process_time, repeat=times, number=1))
 
 
-def ready(scene: str, overrides: dict[str, Any] | None = None, **options: Any) -> Prepared:
+def prepare_scene(scene: str, overrides: dict[str, Any] | None = None, **options: Any) -> Prepared:
+    """Load a scene and prepare its run."""
     return prepare(load_scene(scene, overrides), **options)
 
 
 def run_seconds(scene: str, overrides: dict[str, Any] | None = None, times: int = 5) -> float:
-    """Of a prepared scene, s."""
-    prepared = ready(scene, overrides)
-    return least(lambda: run_prepared(prepared), times)
+    """Return the processor time of a run of a prepared scene, s."""
+    prepared = prepare_scene(scene, overrides)
+    return min_processor_time(lambda: run_prepared(prepared), times)
 
 
 def python_calls() -> float:
-    """Of all shipped scenes in all their formulations, those that start."""
+    """Count calls of Python within the step loop, over all shipped scenes in all formulations."""
     total = 0
     for name, _, scenes in list_catalogue():
         for scene in scenes:
@@ -61,16 +65,23 @@ def python_calls() -> float:
 
 
 def inert_event() -> float:
-    plain, with_event = ready("five_bar/swing"), ready("five_bar/swing", {"event": INERT})
-    pairs = [(least(lambda: run_prepared(with_event), 5), least(lambda: run_prepared(plain), 5)) for _ in range(5)]
+    """Return the time of the swing with an event that never triggers over the time without."""
+    without_event, with_event = prepare_scene("five_bar/swing"), prepare_scene("five_bar/swing", {"event": INERT})
+    pairs = [
+        (
+            min_processor_time(lambda: run_prepared(with_event), 5),
+            min_processor_time(lambda: run_prepared(without_event), 5),
+        )
+        for _ in range(5)
+    ]
     return min(a for a, _ in pairs) / min(b for _, b in pairs)
 
 
-class Own:
-    """Eq. 14 as a caller would write it, its gains numbers."""
+class UserSetPoint:
+    """Set-point controller of eq. 14 as a user would write it, with scalar gains."""
 
     def __init__(self, scene: str) -> None:
-        inner = build_scene_controller(load_scene(scene), ready(scene).mechanism)
+        inner = build_scene_controller(load_scene(scene), prepare_scene(scene).mechanism)
         assert isinstance(inner, SetPoint)
         self.q_d, self.K_P, self.K_V, self.h_d = inner.q_d, inner.K_P[0, 0], inner.K_V[0, 0], inner.target.h
 
@@ -78,15 +89,16 @@ class Own:
         return self.h_d - self.K_P * (terms.q - self.q_d) - self.K_V * terms.q_dot
 
 
-def own_controller() -> float:
-    """Time of a right-hand side, microseconds: a run whose end is its only output."""
+def user_controller_us() -> float:
+    """Return the time of a right-hand side with a user's controller, microseconds. The run records only its end."""
     scene = "five_bar/set_point"
-    prepared = ready(scene, {"solver.output_dt": 5.0}, controller=Own(scene))
-    spent = least(lambda: run_prepared(prepared), 15)
+    prepared = prepare_scene(scene, {"solver.output_dt": 5.0}, controller=UserSetPoint(scene))
+    spent = min_processor_time(lambda: run_prepared(prepared), 15)
     return 1e6 * spent / float(prepared.loop.stats()["rhs"])
 
 
 def step_us(scene: str, overrides: dict[str, Any] | None = None) -> float:
+    """Return the time of `Simulator.step` over 1 ms, microseconds."""
     simulator = Simulator(scene, overrides)
     u = np.zeros(simulator.mechanism.d)
 
@@ -95,27 +107,27 @@ def step_us(scene: str, overrides: dict[str, Any] | None = None) -> float:
         for _ in range(100):
             simulator.step(u, 1e-3)
 
-    return 1e4 * least(steps, 7)
+    return 1e4 * min_processor_time(steps, 7)
 
 
 def circle() -> float:
-    """A whole call with the tip's circle as the desired motion, and with a table of the coordinates on it."""
-    scene, plain = "five_bar/tracking", {"formulation": "reduced", "initial": CIRCLE["initial"]}
-    prepared = ready(scene, {**plain, **CIRCLE})
+    """Return the time of `simulate` with a circle of the tip over that with a table of the same coordinates."""
+    scene, start = "five_bar/tracking", {"formulation": "reduced", "initial": CIRCLE["initial"]}
+    prepared = prepare_scene(scene, {**start, **CIRCLE})
     assert isinstance(prepared.controller, Tracking)
     times = np.linspace(0.0, 10.0, 201)
     rows = [",".join(map(repr, [float(t), *map(float, prepared.controller.desired(min(t, 9.5))[0])])) for t in times]
     with TemporaryDirectory() as folder:
         table = Path(folder) / "circle.csv"
         table.write_text("\n".join([f"t,{','.join(prepared.mechanism.independent)}", *rows]))
-        in_coordinates = {**plain, "controller.desired": {"file": str(table)}}
-        by_point = least(lambda: simulate(scene, {**plain, **CIRCLE}), 5)
-        return by_point / least(lambda: simulate(scene, in_coordinates), 5)
+        in_coordinates = {**start, "controller.desired": {"file": str(table)}}
+        by_point = min_processor_time(lambda: simulate(scene, {**start, **CIRCLE}), 5)
+        return by_point / min_processor_time(lambda: simulate(scene, in_coordinates), 5)
 
 
-def again_us() -> float:
-    """Time of `run_prepared` beyond that of the loop alone, microseconds."""
-    prepared = ready("five_bar/swing", {"t_end": 1e-3, "solver.output_dt": 1e-3})
+def run_overhead_us() -> float:
+    """Return the time that `run_prepared` takes beyond the native loop, microseconds."""
+    prepared = prepare_scene("five_bar/swing", {"t_end": 1e-3, "solver.output_dt": 1e-3})
     times, rows = np.array([0.0, 1e-3]), np.empty((3, prepared.loop.width))
 
     def native() -> None:
@@ -123,11 +135,11 @@ def again_us() -> float:
         prepared.loop.record(times, rows)
         prepared.loop.advance(until=1e-3, final=True, pause=0.05, budget=60.0)
 
-    return 1e6 * (least(lambda: run_prepared(prepared), 300) - least(native, 300))
+    return 1e6 * (min_processor_time(lambda: run_prepared(prepared), 300) - min_processor_time(native, 300))
 
 
 def process_seconds(*words: str) -> float:
-    """User and system time of a process, s."""
+    """Return user and system time of a process, s, the minimum of nine runs after a first one."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 
     def once() -> float:
@@ -141,12 +153,14 @@ def process_seconds(*words: str) -> float:
 
 
 def command() -> float:
+    """Return the time of `ckc run` over that of importing Pinocchio."""
     ckc = str(Path(sys.executable).parent / "ckc")
     run = process_seconds(ckc, "run", "five_bar/swing", "--json")
     return run / process_seconds(sys.executable, "-c", "import pinocchio")
 
 
 def lines() -> float:
+    """Count the lines of the run loop's source in Python and C++."""
     files = [
         path
         for folder in ("ckc_pin/simulation", "ckc_pin/native")
@@ -157,10 +171,10 @@ def lines() -> float:
 
 
 def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
-    """What is measured, how, at most, in which unit."""
+    """Yield the lines of the table: what is measured, the function, its upper bound and the unit."""
     yield "Python calls in the loop, all shipped scenes", python_calls, 0, ""
     yield "swing with an inert event / without", inert_event, 1.15, ""
-    yield "a caller's Python controller, a right-hand side", own_controller, 12, "us"
+    yield "a caller's Python controller, a right-hand side", user_controller_us, 12, "us"
     yield (
         "tracking with sample_time = 1e-3, 9.5 s",
         lambda: run_seconds("five_bar/tracking", {"controller.sample_time": 1e-3, "t_end": 9.5}, 3),
@@ -172,23 +186,28 @@ def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
     yield "a tip's circle tracked / the same by a table of coordinates, whole", circle, 3, ""
     yield "talos/default", lambda: run_seconds("talos/default"), 0.8, "s"
     yield "flyball as DAE to 1e-6", lambda: run_seconds("flyball", {"solver.rtol": 1e-6}), 0.3, "s"
-    yield "a run again, beyond the loop's own time", again_us, 50, "us"
-    yield 'simulate("five_bar/swing") whole', lambda: 1e3 * least(lambda: simulate("five_bar/swing"), 20), 3, "ms"
+    yield "a run again, beyond the loop's own time", run_overhead_us, 50, "us"
+    yield (
+        'simulate("five_bar/swing") whole',
+        lambda: 1e3 * min_processor_time(lambda: simulate("five_bar/swing"), 20),
+        3,
+        "ms",
+    )
     yield "ckc run five_bar/swing --json / import pinocchio", command, 1.8, ""
     yield "lines of ckc_pin/simulation and native", lines, LINES, ""
 
 
 def main(only: str = "") -> int:
-    """Print a Markdown table of the lines with some words; return 1 when a bound is missed."""
+    """Print a Markdown table of the lines that contain `only`; return 1 if a bound is exceeded."""
     print("| what | measured | at most |\n|---|---|---|")
     missed = 0
     with one_blas_thread():
         for what, measure, bound, unit in rows():
             if only not in what:
                 continue
-            found = measure()
-            missed += found > bound
+            value = measure()
+            missed += value > bound
             print(
-                f"| {what} | {found:.4g} {unit} | {bound:g} {unit}{', missed' if found > bound else ''} |", flush=True
+                f"| {what} | {value:.4g} {unit} | {bound:g} {unit}{', missed' if value > bound else ''} |", flush=True
             )
     return 1 if missed else 0

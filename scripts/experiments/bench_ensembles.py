@@ -1,6 +1,6 @@
-"""Prints what ensembles cost: the five-bar's swings in threads, beside MuJoCo's rollout at equal error, and by Dask.
+"""Benchmark of ensembles: the five-bar's swings in threads, and compared with MuJoCo's rollout at equal error.
 
-Processor seconds are of the whole process, its threads included; they are the steadier where other work goes on.
+Processor seconds are those of the whole process with all its threads. On a busy machine they vary less than the clock.
 """
 
 from __future__ import annotations
@@ -22,44 +22,48 @@ from ckc_pin.formats.exporting import export
 SCENE, T_END = "five_bar/swing", 2.0
 START = ("initial.q.theta_1",)
 LOW, HIGH = (-1.2,), (-0.9,)
-VARIED = (*START, "link.link_2.mass", "joint.theta_2.xyz.x")
-VARIED_LOW, VARIED_HIGH = (*LOW, 0.24, 0.25), (*HIGH, 0.28, 0.27)
-JUDGED = 24  # members whose error is measured
+PARAMETERS = (*START, "link.link_2.mass", "joint.theta_2.xyz.x")
+PARAMETERS_LOW, PARAMETERS_HIGH = (*LOW, 0.24, 0.25), (*HIGH, 0.28, 0.27)
+COMPARED_MEMBERS = 24  # members whose error is measured
 TARGETS = (1e-3, 1e-6)
 
 
 def draw(members: int, low: tuple[float, ...], high: tuple[float, ...]) -> Array:
+    """Draw uniform values of the variables, shape (members, variables)."""
     return np.random.default_rng(1).uniform(low, high, (members, len(low)))
 
 
 def timed(members: Members, values: Array) -> tuple[float, float, Array]:
-    """Seconds of the clock and of the processor, and the ends."""
+    """Return wall time and processor time in s, and the members' q_tree at the end."""
     members.run(0, values[:2])
     clock, processor = time.perf_counter(), time.process_time()
-    found = members.run(0, values)
-    return time.perf_counter() - clock, time.process_time() - processor, found.outputs["end"]
+    chunk = members.run(0, values)
+    return time.perf_counter() - clock, time.process_time() - processor, chunk.outputs["end"]
 
 
-def ours(
+def run_members(
     rtol: float, terms: str, threads: int, values: Array, names: tuple[str, ...] = START
 ) -> tuple[float, float, Array]:
+    """Run members of the ensemble: wall time and processor time in s, and q_tree at the end."""
     overrides = {"solver.rtol": rtol, "solver.terms": terms}
     return timed(Members(SCENE, overrides, names, {"end": "q_tree"}, len(values), threads), values)
 
 
 def table(count: int, threads: int) -> None:
-    """Seconds for 10,000 members at 1e-6."""
+    """Print the seconds that 10,000 members take at rtol 1e-6."""
     print(f"10,000 swings of {T_END:g} s at rtol 1e-6, ends kept; measured on {count}\n")
     print("| terms | varied | threads | s of the clock | s of the processor |\n|---|---|---|---|---|")
-    for terms, (names, low, high), many in product(
-        ("generated", "pinocchio"), ((START, LOW, HIGH), (VARIED, VARIED_LOW, VARIED_HIGH)), (1, threads)
+    for terms, (names, low, high), workers in product(
+        ("generated", "pinocchio"), ((START, LOW, HIGH), (PARAMETERS, PARAMETERS_LOW, PARAMETERS_HIGH)), (1, threads)
     ):
-        clock, processor, _ = ours(1e-6, terms, many, draw(count, low, high), names)
-        print(f"| {terms} | {', '.join(names)} | {many} | {clock / count * 1e4:.2f} | {processor / count * 1e4:.2f} |")
+        clock, processor, _ = run_members(1e-6, terms, workers, draw(count, low, high), names)
+        print(
+            f"| {terms} | {', '.join(names)} | {workers} | {clock / count * 1e4:.2f} | {processor / count * 1e4:.2f} |"
+        )
 
 
 def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, Array]]:
-    """MuJoCo's: (method, dt, seconds of the clock, ends), from coarse to fine steps."""
+    """Run MuJoCo's rollout from coarse to fine steps; yield method, dt, wall time in s and q_tree at the end."""
     from mujoco import MjData, mj_getState, mjtState
     from mujoco.rollout import Rollout
 
@@ -85,47 +89,49 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
             steps = round(100 * 2**k * T_END)
             configure_model(model, integrator, stiffness, T_END / steps)
             started = time.perf_counter()
-            found, _ = pool.rollout(model, datas, initial, nstep=steps)
+            trajectories, _ = pool.rollout(model, datas, initial, nstep=steps)
             seconds = time.perf_counter() - started
             ends = []
-            for row in found[:, -1]:
+            for row in trajectories[:, -1]:
                 datas[0].qpos[:] = row[1 : 1 + model.nq]
                 datas[0].qvel[:] = row[1 + model.nq :]
                 ends.append(joints.get_state(datas[0])[0])
             yield f"{integrator}, {stiffness}", T_END / steps, seconds, np.array(ends)
 
 
-def beside(threads: int) -> None:
-    """Rates at equal error, both programs in turn in one process."""
-    values = draw(JUDGED, LOW, HIGH)
-    _, _, exact = ours(1e-12, "pinocchio", threads, values)
+def compare_with_mujoco(threads: int) -> None:
+    """Print members per second at equal error, both programs in turn in one process."""
+    values = draw(COMPARED_MEMBERS, LOW, HIGH)
+    _, _, exact = run_members(1e-12, "pinocchio", threads, values)
     many = draw(400, LOW, HIGH)
-    own: dict[float, tuple[float, float]] = {}
+    settings: dict[float, tuple[float, float]] = {}
     for target, rtol in product(TARGETS, (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)):
-        error = float(np.abs(ours(rtol, "generated", threads, values)[2] - exact).max())
-        if error <= target and target not in own:
-            own[target] = rtol, error
+        error = float(np.abs(run_members(rtol, "generated", threads, values)[2] - exact).max())
+        if error <= target and target not in settings:
+            settings[target] = rtol, error
     print("\n| error | ckc_pin, members a second | MuJoCo's rollout, members a second | times |\n|---|---|---|---|")
     best: dict[float, tuple[float, str]] = {}
-    least = (np.inf, "")
+    smallest = (np.inf, "")
     for method, dt, seconds, ends in rollouts(values, threads):
         error = float(np.abs(ends - exact).max())
-        least = min(least, (error, f"{method}, dt = {dt:.2g} s"))
+        smallest = min(smallest, (error, f"{method}, dt = {dt:.2g} s"))
         for target in TARGETS:
-            rate = JUDGED / seconds
+            rate = COMPARED_MEMBERS / seconds
             if error <= target and (target not in best or best[target][0] < rate):
                 best[target] = rate, f"{method}, dt = {dt:.2g} s"
     for target in TARGETS:
-        rtol, error = own[target]
-        rate = len(many) / ours(rtol, "generated", threads, many)[0]
+        rtol, error = settings[target]
+        rate = len(many) / run_members(rtol, "generated", threads, many)[0]
         there = best.get(target)
-        other = f"{there[0]:,.1f} ({there[1]})" if there else f"none; its least error is {least[0]:.1e} ({least[1]})"
+        other = (
+            f"{there[0]:,.1f} ({there[1]})" if there else f"none; its least error is {smallest[0]:.1e} ({smallest[1]})"
+        )
         print(f"| {target:g} | {rate:,.0f} (rtol {rtol:g}, error {error:.1e}) | {other} | "
               f"{f'{rate / there[0]:,.0f}' if there else ''} |")  # fmt: skip
 
 
 def main(runs: int) -> None:
-    """Print Markdown tables."""
+    """Print both tables as Markdown, for `runs` thousand members."""
     threads = os.cpu_count() or 1
     table(1000 * runs, threads)
-    beside(threads)
+    compare_with_mujoco(threads)

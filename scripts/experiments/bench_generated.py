@@ -1,4 +1,4 @@
-"""What terms written out for one mechanism cost and save: each figure with Pinocchio's terms beside it."""
+"""Benchmark of compiled terms: what they cost and save, compared with Pinocchio's terms."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.native.plant import Plant
 from ckc_pin.run.simulate import run_prepared
-from scripts.experiments.bench import least, ready
+from scripts.experiments.bench import min_processor_time, prepare_scene
 from scripts.experiments.generated_sizes import empty_cache
 
-Measured = tuple[float, float]  # with terms written out, with Pinocchio's
+Measured = tuple[float, float]  # with compiled terms, with Pinocchio's terms
 
 RHS_NS = (("five_bar/swing", 150), ("andrews", 300), ("bricard", 350), ("delta", 900))
 SWING_MS = ((1e-3, 0.12), (1e-6, 0.2), (1e-9, 0.35))
@@ -28,61 +28,61 @@ TERMS = ("generated", "pinocchio")
 
 
 def _loop(scene: str, terms: str, overrides: dict[str, Any]) -> Any:
-    prepared = ready(scene, {**overrides, "solver.terms": terms})
+    prepared = prepare_scene(scene, {**overrides, "solver.terms": terms})
     prepared.begin()
     return prepared.loop
 
 
 def rhs_ns(scene: str) -> Measured:
-    """A right-hand side as the loop calls it, at the start and near it."""
-    found = []
+    """Return the time of a right-hand side as the loop calls it, at states near the start, ns."""
+    times = []
     for terms in TERMS:
         loop = _loop(scene, terms, {"formulation": "dae"})
-        found.append(1e9 * loop.seconds(_near(loop), 2000))
-    return found[0], found[1]
+        times.append(1e9 * loop.seconds(_perturbed_states(loop), 2000))
+    return times[0], times[1]
 
 
-def _near(loop: Any) -> Array:
-    """Rows of (t, y)."""
-    near = loop.y + 1e-3 * np.random.default_rng(0).standard_normal((20, len(loop.y)))
-    return np.column_stack([np.zeros(20), near])
+def _perturbed_states(loop: Any) -> Array:
+    """Return 20 rows of (t, y) near the loop's state."""
+    states = loop.y + 1e-3 * np.random.default_rng(0).standard_normal((20, len(loop.y)))
+    return np.column_stack([np.zeros(20), states])
 
 
 def jacobian() -> Measured:
-    """The five-bar's Jacobian in right-hand sides, both as the loop calls them, at the start and near it."""
-    found = []
+    """Return the time of the five-bar's Jacobian over that of a right-hand side, both as the loop calls them."""
+    ratios = []
     for terms in TERMS:
         loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
-        states = _near(loop)
-        found.append(loop.seconds(states, 5000, True) / loop.seconds(states, 5000))
-    return found[0], found[1]
+        states = _perturbed_states(loop)
+        ratios.append(loop.seconds(states, 5000, True) / loop.seconds(states, 5000))
+    return ratios[0], ratios[1]
 
 
 def plant() -> Measured:
-    """A and B of the five-bar, moving, in right-hand sides as `jacobian` has them."""
+    """Return the time of A and B of the moving five-bar over that of a right-hand side."""
     mechanism = load("five_bar")
     at = mechanism.assembled
-    state, found = Terms(mechanism, at, at.rho @ np.array([1.0, -2.0])), []
+    state, ratios = Terms(mechanism, at, at.rho @ np.array([1.0, -2.0])), []
     for terms, library in zip(TERMS, (compile_terms(mechanism), None), strict=True):
         loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
         alone = loop.seconds(np.append(0.0, loop.y)[np.newaxis], 20000)
-        found.append(Plant(mechanism, library=library).seconds(state, np.zeros(mechanism.n)) / alone)
-    return found[0], found[1]
+        ratios.append(Plant(mechanism, library=library).seconds(state, np.zeros(mechanism.n)) / alone)
+    return ratios[0], ratios[1]
 
 
 def linearize_ms() -> Measured:
-    """The whole call at coordinates, the mechanism being loaded: terms that are there, or none."""
-    found, q = [], {"theta_1": -1.1, "theta_3": -1.8}
+    """Return the time of `linearize` at given coordinates, ms. The mechanism is loaded and its terms are compiled."""
+    times, q = [], {"theta_1": -1.1, "theta_3": -1.8}
     mechanism = load("five_bar")
     compile_terms(mechanism)
     for cached in (True, False):
         with TemporaryDirectory() as folder, nullcontext() if cached else empty_cache(Path(folder)):
-            found.append(1e3 * least(lambda: linearize(mechanism, q), 30))
-    return found[0], found[1]
+            times.append(1e3 * min_processor_time(lambda: linearize(mechanism, q), 30))
+    return times[0], times[1]
 
 
 def compile_seconds(name: str) -> Measured:
-    """Expressions, C, compiling and comparing, into an empty cache; and finding it there."""
+    """Return the time of `compile_terms` with an empty cache, and with the library in the cache, s."""
     mechanism, times = load(name), []
     with TemporaryDirectory() as folder, empty_cache(Path(folder)):
         for _ in range(2):
@@ -93,17 +93,17 @@ def compile_seconds(name: str) -> Measured:
 
 
 def run_ms(scene: str, overrides: dict[str, Any]) -> Measured:
-    """The loop's own time, the least of several runs."""
-    found = []
+    """Return the time spent in the loop, ms, the minimum of several runs."""
+    times = []
     for terms in TERMS:
-        prepared = ready(scene, {**overrides, "solver.terms": terms})
-        found.append(1e3 * min(float(run_prepared(prepared).stats["wall_s"]) for _ in range(9)))
-    return found[0], found[1]
+        prepared = prepare_scene(scene, {**overrides, "solver.terms": terms})
+        times.append(1e3 * min(float(run_prepared(prepared).stats["wall_s"]) for _ in range(9)))
+    return times[0], times[1]
 
 
 def step_us() -> Measured:
-    """A step of 1 ms whose u is another one each time."""
-    found = []
+    """Return the time of `Simulator.step` over 1 ms with another u in each step, microseconds."""
+    times = []
     for terms in TERMS:
         simulator = Simulator("five_bar/swing", {"solver.terms": terms})
         us = [np.array([0.1 * np.sin(k), 0.0]) for k in range(200)]
@@ -113,30 +113,30 @@ def step_us() -> Measured:
             for u in us:
                 simulator.step(u, 1e-3)
 
-        found.append(1e6 * least(steps, 15) / len(us))
-    return found[0], found[1]
+        times.append(1e6 * min_processor_time(steps, 15) / len(us))
+    return times[0], times[1]
 
 
 def rows() -> Iterator[tuple[str, Any, float, str]]:
-    """What is measured, how, at most, in which unit."""
-    for scene, most in RHS_NS:
-        yield f"DAE right-hand side, {scene.partition('/')[0]}", partial(rhs_ns, scene), most, "ns"
+    """Yield the lines of the table: what is measured, the function, its upper bound and the unit."""
+    for scene, bound in RHS_NS:
+        yield f"DAE right-hand side, {scene.partition('/')[0]}", partial(rhs_ns, scene), bound, "ns"
     yield "its Jacobian, five_bar", jacobian, 3, "right-hand sides"
     yield "A and B, five_bar", plant, 5, "right-hand sides"
     yield "linearize whole, five_bar at coordinates", linearize_ms, 5, "ms"
-    for name, most in (("five_bar", 2), ("delta", 10)):
-        yield f"compiling {name}, and finding it", partial(compile_seconds, name), most, "s"
-    for rtol, bound in SWING_MS:
+    for name, bound in (("five_bar", 2), ("delta", 10)):
+        yield f"compiling {name}, and finding it", partial(compile_seconds, name), bound, "s"
+    for rtol, bound_ms in SWING_MS:
         tight = {"solver.rtol": rtol, "solver.atol": rtol, "solver.output_dt": 2.0}
-        yield f"swing 2 s to {rtol:g}, its end alone", partial(run_ms, "five_bar/swing", tight), bound, "ms"
+        yield f"swing 2 s to {rtol:g}, its end alone", partial(run_ms, "five_bar/swing", tight), bound_ms, "ms"
     sampled = {"controller.sample_time": 1e-3, "t_end": 9.5}
     yield "tracking with sample_time = 1e-3, 9.5 s", partial(run_ms, "five_bar/tracking", sampled), 60, "ms"
     yield "Simulator.step of 1 ms, five_bar", step_us, 6, "us"
 
 
 def main(only: str = "") -> int:
-    """Print a Markdown table of the lines with some words; return 1 when a bound is missed."""
-    print("| terms written out | measured | at most | with Pinocchio's |\n|---|---|---|---|")
+    """Print a Markdown table of the lines that contain `only`; return 1 if a bound is exceeded."""
+    print("| compiled terms | measured | at most | with Pinocchio's |\n|---|---|---|---|")
     missed = 0
     for what, measure, bound, unit in rows():
         if only not in what:

@@ -1,4 +1,4 @@
-"""What sensitivities cost: processor time of the loop with p parameters by that without."""
+"""Benchmark of sensitivities: processor time of the loop with p parameters over the time without."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from time import process_time
 
 from ckc_pin.run.simulate import record_rows
 from ckc_pin.sensitivity.parameters import derivatives_of
-from scripts.experiments.bench import ready
+from scripts.experiments.bench import prepare_scene
 
-# A scene, its tolerance, and names of which the first p vary.
+# A scene, its tolerance, and parameter names; the first p of them get sensitivities.
 RUNS = (
     ("five_bar/swing", 1e-9, ("link.link_2.mass", "initial.q.theta_1", "link.link_3.mass", "gravity.y",
                               "link.link_2.com.x", "joint.theta_2.xyz.x")),
@@ -22,32 +22,34 @@ TERMS = {"pinocchio": "Pinocchio's", "generated": "generated"}
 
 
 def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[tuple[float, float]]:
-    """Of runs with 1, 2 and 6 parameters: seconds by those of a run without, and right-hand sides by its own.
+    """Compare runs with 1, 2 and 6 parameters with a run without: ratios of seconds and of right-hand sides.
 
-    The least of several, taken in turns.
+    Times are the minimum of several repetitions, with all runs in turn.
     """
     overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.terms": terms}
-    runs = [ready(scene, overrides, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)]
+    runs = [
+        prepare_scene(scene, overrides, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)
+    ]
     seconds: list[list[float]] = [[] for _ in runs]
     for _ in range(TIMES):
-        for run, found in zip(runs, seconds, strict=True):
+        for run, times in zip(runs, seconds, strict=True):
             began = process_time()
             record_rows(run)
-            found.append(process_time() - began)
-    least, rhs = [min(found) for found in seconds], [run.loop.stats()["rhs"] for run in runs]
-    return [(a / least[0], b / rhs[0]) for a, b in zip(least[1:], rhs[1:], strict=True)]
+            times.append(process_time() - began)
+    fastest, rhs = [min(times) for times in seconds], [run.loop.stats()["rhs"] for run in runs]
+    return [(a / fastest[0], b / rhs[0]) for a, b in zip(fastest[1:], rhs[1:], strict=True)]
 
 
 def main(only: str = "") -> int:
-    """Print a Markdown table of the lines with some words; return 1 when one written out takes more than 1 + p."""
+    """Print a Markdown table of the lines that contain `only`; return 1 if compiled terms take more than 1 + p."""
     print("| run | terms |", *(f"p = {p} |" for p in NUMBERS), "\n|---|---|---:|---:|---:|")
     missed = 0
     for scene, rtol, names in RUNS:
         for terms, says in TERMS.items():
             if only not in f"sensitivities, {scene}, {says}":
                 continue
-            found = ratios(scene, rtol, names, terms)
-            missed += terms == "generated" and any(x > 1 + p for p, (x, _) in zip(NUMBERS, found, strict=True))
-            cells = " | ".join(f"{x:.2f}, {n:.2f} right-hand sides" for x, n in found)
+            pairs = ratios(scene, rtol, names, terms)
+            missed += terms == "generated" and any(x > 1 + p for p, (x, _) in zip(NUMBERS, pairs, strict=True))
+            cells = " | ".join(f"{x:.2f}, {n:.2f} right-hand sides" for x, n in pairs)
             print(f"| `{scene}`, `rtol = {rtol:g}` | {says} | {cells} |", flush=True)
     return 1 if missed else 0

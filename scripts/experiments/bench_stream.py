@@ -1,8 +1,8 @@
-"""Prints right-hand sides per second of a run without a view, and with viewers of several kinds, best of several runs.
+"""Benchmark of live views: right-hand sides per second without a view and with several viewers, best of several runs.
 
-Seconds are those of the clock, and those of the processor that the whole process took, its view's threads included; the
-second are the steadier where other work goes on. A viewer is a process of its own that speaks the browser's protocol: a
-fast one answers each frame at once, a slow one twice a second, and one that hangs reads nothing at all.
+Wall time and processor time are both printed. Processor time is that of the whole process, including the view's
+threads; on a busy machine it varies less. A viewer is a separate process that speaks the browser's protocol. A fast
+viewer answers each frame at once, a slow one twice a second, and one that hangs reads nothing.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ asyncio.run(look(sys.argv[1], float(sys.argv[2])))
 
 
 def measure(name: str) -> tuple[float, float, str]:
-    """Right-hand sides per second of one run, by the clock and by the processor; frames that the viewer was sent."""
+    """Return right-hand sides per second of one run, by wall time and processor time, and a text on frames sent."""
     scene = ckc_pin.load_scene(SCENE, OVERRIDES)
     viewer, pause = None, VIEWERS[name]
     with ExitStack() as stack:
@@ -75,12 +75,12 @@ def measure(name: str) -> tuple[float, float, str]:
 
 
 def main(runs: int) -> None:
-    """Print a Markdown table."""
+    """Run every viewer `runs` times and print a Markdown table."""
     print(f"{SCENE}, {OVERRIDES}\n")
     print("| viewer | per second of the clock | of the processor | share | frames |\n|---|---|---|---|---|")
     columns = ["viewer", "clock", "processor", "frames"]
     rounds = pd.DataFrame([(name, *measure(name)) for _ in range(runs) for name in VIEWERS], columns=columns)
-    # the viewers in turn: other work falls on all
+    # Take the viewers in turn, so that other work on the machine affects all of them.
     best = rounds.groupby("viewer", sort=False).agg({"clock": "max", "processor": "max", "frames": "last"})
     best["share"] = 100 * best.processor / best.processor["no view"]
     for row in best.itertuples():

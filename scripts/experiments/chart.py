@@ -1,4 +1,4 @@
-"""The studies' figures: one look, written as PNG without a display; every picture of docs/ as a small file."""
+"""Figures of the studies: one style, PNG files without a display, and small files for all pictures of docs/."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 __all__ = ["BLACK", "COLOURS", "chart", "save", "shrink", "whole_decades"]
 
-# Okabe and Ito's colours, told apart by every eye; yellow is left out, which is hard to see as a line.
+# Okabe and Ito's colours, which colour-blind readers can distinguish. Yellow is left out: its lines are hard to see.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BLACK = "#000000"
-SEEN = 16  # of 255: what a colour of a palette may be off
+SEEN = 16  # of 255: largest difference of a colour from its palette
 
 
 def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6)) -> tuple[Any, Any]:
-    """Return a figure with rows of axes, each of a size in inches: (Figure, flat array of Axes)."""
+    """Return a figure and a flat array of its axes, each with `size` in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=110 if size[0] > 5 else 160, layout="constrained")
@@ -27,7 +27,7 @@ def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6
 
 
 def whole_decades(ax: Any) -> None:
-    """End logarithmic axes at powers of ten, which alone have a label: those between run into each other."""
+    """End logarithmic axes at powers of ten and label these only, since labels between them would overlap."""
     ax.minorticks_off()
     for axis, room, (low, high) in zip("xy", (1.0, 1.6), ax.dataLim.get_points().T, strict=True):
         if 0 < low <= high < np.inf:
@@ -36,7 +36,7 @@ def whole_decades(ax: Any) -> None:
 
 
 def save(figure: Any, folder: Path, name: str) -> str:
-    """Write a figure into a folder, which is made if need be; return its file name."""
+    """Write a figure into a folder, which is created if necessary; return the file name."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
@@ -48,7 +48,7 @@ def save(figure: Any, folder: Path, name: str) -> str:
 
 
 def shrink(path: Path) -> None:
-    """Write a PNG again as small as it can be without a difference that is seen; one with a palette is left."""
+    """Rewrite a PNG as small as possible without a visible difference. A file with a palette is left as it is."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -57,7 +57,7 @@ def shrink(path: Path) -> None:
 
 
 def _write(image: Any, path: Path) -> None:
-    """Write a picture with a palette, which takes a third, or without where shades would turn into others."""
+    """Write a picture with a palette, a third of the size, or without one if shades would change visibly."""
     from PIL import Image
 
     exact = image.convert("RGB")

@@ -1,4 +1,4 @@
-"""Two studies by ensembles: what wrong lengths do to tracking, and from where set-point control settles."""
+"""Two studies by ensembles: tracking with inaccurate link lengths, and the basin of attraction of a set point."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ LENGTHS = {
     "l3, right proximal": "joint.theta_4.xyz.x",
     "l4, right distal": "loop.elbow.frame_b.xyz.x",
 }
-DEVIATION = 1e-4  # m: what a length is wrong by
+DEVIATION = 1e-4  # m: standard deviation of a length's error
 HANGING = {"theta_1": -1.434308508, "theta_3": -1.707332169}  # near where tracking starts as shipped
 TRACKING: dict[str, Any] = {
     "formulation": "reduced", "solver.rtol": 1e-7, "controller.model": "mechanism.toml", "initial.at": None,
     **{f"initial.q.{name}": x for name, x in HANGING.items()},
 }  # fmt: skip
-LATTICE = (-1.9, 1.9)  # rad: of both starts
+LATTICE = (-1.9, 1.9)  # rad: range of both starting angles
 
 
 def tolerances(out: Path, members: int, weighed_by: int) -> str:
-    """Vary the plant's lengths, the controller's model keeping its own; say what that does to q - q_d."""
+    """Draw the plant's lengths at random, with an exact controller model; return tables of the change of q - q_d."""
     nominal = {name: _nominal(key) for name, key in LENGTHS.items()}
     variables = {LENGTHS[name]: {"normal": [x, DEVIATION]} for name, x in nominal.items()}
     outputs: dict[str, Any] = {
         "worst": {"of": "error", "reduce": "max_abs"}, "rms": {"of": "error", "reduce": "rms"},
         "late": {"of": "theta_1", "reduce": "end"}, "error": {"of": "error", "reduce": "trajectory"},
     }  # fmt: skip
-    found = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, overrides=TRACKING)
+    perturbed = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, overrides=TRACKING)
     exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, overrides=TRACKING)
-    change = found["error"] - exact["error"][0]
+    change = perturbed["error"] - exact["error"][0]
     draw_quantiles(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
     lines = ["| joint | rms error, exact lengths (rad) | change by wrong lengths: 95 % stay below, the most (rad) |",
              "|---|---|---|"]  # fmt: skip
-    for name in found["independent"].to_numpy():
-        most = abs(change.sel(independent=name)).max("time")
+    for name in perturbed["independent"].to_numpy():
+        peak = abs(change.sel(independent=name)).max("time")
         nominal_rms = float(exact["rms"].sel(independent=name)[0])
-        lines.append(f"| {name} | {nominal_rms:.2e} | {float(most.quantile(0.95)):.2e}, {float(most.max()):.2e} |")
+        lines.append(f"| {name} | {nominal_rms:.2e} | {float(peak.quantile(0.95)):.2e}, {float(peak.max()):.2e} |")
     data = {"scene": "five_bar/tracking", "variables": variables, "outputs": {"late": "theta_1"}, "seed": 1,
             "members": members, "overrides": dict(TRACKING)}  # fmt: skip
     weighed = compute_sobol_indices(
@@ -66,31 +66,31 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
 
 
 def basin(out: Path, count: int) -> str:
-    """Start at rest from a lattice, and compare where it settles with what the certificate proves."""
+    """Start at rest from a lattice of angles and compare the basin of attraction with the certified set."""
     case = load_case({"formulation": "reduced"})
     proved = certify(case.mechanism, case.controller, case.start)
     grid = {"grid": {"start": LATTICE[0], "stop": LATTICE[1], "count": count}}
     names = ("initial.q.theta_1", "initial.q.theta_3")
-    found = ckc_pin.ensemble(
+    data_set = ckc_pin.ensemble(
         "five_bar/set_point", dict.fromkeys(names, grid), {"end": "q_tree", "settled": "settled", "u": "max_abs_u"},
         overrides={"formulation": "reduced", "initial": {"q": HANGING}, "solver.rtol": 1e-6, "t_end": 10.0},
     )  # fmt: skip
     for name in names:
-        found[name].attrs["units"] = "rad"
-    starts = np.column_stack([found[name].to_numpy() for name in names])
-    home = (found["settled"].to_numpy() == 1.0) & (found["status"].to_numpy() == 1)
+        data_set[name].attrs["units"] = "rad"
+    starts = np.column_stack([data_set[name].to_numpy() for name in names])
+    home = (data_set["settled"].to_numpy() == 1.0) & (data_set["status"].to_numpy() == 1)
     inside = _proved(case, proved.safe_level, starts)
-    found_map = ckc_pin.singularity_map("five_bar")
+    map_ = ckc_pin.singularity_map("five_bar")
     q = case.mechanism.partition.q
-    curves = [_broken(locus.q_tree[:, q]) for locus in found_map.loci if locus.kind != "serial"]
+    curves = [_broken(locus.q_tree[:, q]) for locus in map_.loci if locus.kind != "serial"]
     target = case.controller.q_d
-    draw_basins(found, names, "end", out / "basin.png", settled="settled", curves=curves,
+    draw_basins(data_set, names, "end", out / "basin.png", settled="settled", curves=curves,
                 marks=[("$q_d$", float(target[0]), float(target[1]))])  # fmt: skip
-    can = found["status"].to_numpy() != 3
+    can = data_set["status"].to_numpy() != 3
     return "\n".join(
         [
             f"starts {len(starts)}, of which the mechanism can have {can.sum()}; settle at q_d {home.sum()}",
-            f"stopped on the way {np.count_nonzero(found['status'].to_numpy() == 2)}",
+            f"stopped on the way {np.count_nonzero(data_set['status'].to_numpy() == 2)}",
             f"the scene's start: {proved.status} ({proved.reason}); proved up to V_L = {proved.safe_level:.3g} J of "
             f"{proved.level:.3g} J",
             f"starts within what is proved {inside.sum()}, of which settle at q_d {np.count_nonzero(inside & home)}",
@@ -99,20 +99,20 @@ def basin(out: Path, count: int) -> str:
 
 
 def _proved(case: Any, level: float, starts: Array) -> BoolArray:
-    """Which starts are in the part of {U <= level} around q_d, by the certificate's lattice."""
-    known = sublevel_set(case.mechanism, case.controller, level)
-    nodes = np.array([case.mechanism.independent_part(at.q_tree) for at in known.explored.nodes])
+    """Return which starts are in the part of {U <= level} around q_d, by the certificate's lattice."""
+    region = sublevel_set(case.mechanism, case.controller, level)
+    nodes = np.array([case.mechanism.independent_part(at.q_tree) for at in region.explored.nodes])
     inside = np.zeros(len(starts), bool)
     for k, q in enumerate(starts):
-        near = np.all(np.abs(nodes - q) <= known.step, axis=1).any()
-        if near:
+        has_neighbour = np.all(np.abs(nodes - q) <= region.step, axis=1).any()
+        if has_neighbour:
             at = sigma(case.mechanism, q, case.controller.target.at)
             inside[k] = at.verdict == "converged" and rest_height(case.mechanism, case.controller, at.at) <= level
     return inside
 
 
 def _broken(curve: Array) -> Array:
-    """Take a curve of angles into one turn, broken where it leaves it."""
+    """Wrap a curve of angles to [-pi, pi), with a row of NaN at each jump."""
     turned = (curve + np.pi) % (2 * np.pi) - np.pi
     jumps = np.flatnonzero(np.abs(np.diff(turned, axis=0)).max(axis=1) > np.pi) + 1
     return np.insert(turned, jumps, np.nan, axis=0)

@@ -1,8 +1,8 @@
-"""Up to which size terms written out for one mechanism pay: text, time to compile, gain, and runs that repay it.
+"""Benchmark of compiled terms by size of the mechanism: length of the C text, compile time, speed-up, break-even.
 
-Rows of squares have 2 N + 1 coordinates in branches of two at most; shipped mechanisms have longer ones; a ring of n
-hinges in space, which is one branch, is the longest text that n coordinates can have. Times are a processor's but for
-right-hand sides, which are the least of many.
+A row of N squares has 2 N + 1 coordinates in branches of two at most. Shipped mechanisms have longer branches. A ring
+of n hinges in space is one branch and has the longest text of all mechanisms with n coordinates. Compile times are
+processor times; times of right-hand sides are the minimum of many.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
-from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, written
+from scripts.experiments.benchmark.growth import ROUNDS, Case, motion, write_case
 
 __all__ = ["NAMES", "Size", "main", "measure"]
 
@@ -42,25 +42,25 @@ NAMES = (
     "ring_48",
 )
 REPEATS = 5
-SIDE, AXES = 0.2, ("0 0 1", "1 0 0", "0 1 0")  # of the ring: a link's length, m; about what its hinges turn
+SIDE, AXES = 0.2, ("0 0 1", "1 0 0", "0 1 0")  # of the ring: length of a link, m; axes of the hinges in turn
 
 
 @dataclass(frozen=True)
 class Size:
-    """A mechanism.
+    """Measurements of one mechanism.
 
     Attributes
     ----------
     name : str
-        Or the number N of squares, or ring_n.
+        Name of a shipped mechanism, number N of squares, or ring_n.
     n, operations, bytes : int
-        Coordinates; operations of an acceleration; of the C text.
+        Coordinates; operations of an acceleration; length of the C text.
     expressions_s, compile_s : float
-        To write the text; for all that `ckc compile` does.
-    written_s, general_s : float
-        A right-hand side of the DAE with terms written out, with Pinocchio's.
+        Time to write the C text; time of everything that `ckc compile` does.
+    compiled_rhs_s, pinocchio_rhs_s : float
+        Time of a right-hand side of the DAE with compiled terms, and with Pinocchio's.
     reason : str
-        Why there are no times.
+        Why there are no times; empty otherwise.
     """
 
     name: str
@@ -69,35 +69,36 @@ class Size:
     bytes: int
     expressions_s: float
     compile_s: float
-    written_s: float = 0.0
-    general_s: float = 0.0
+    compiled_rhs_s: float = 0.0
+    pinocchio_rhs_s: float = 0.0
     reason: str = ""
 
     @property
     def repaid(self) -> float:
-        """Right-hand sides from which compiling costs less than it saves."""
-        return self.compile_s / (self.general_s - self.written_s)
+        """Number of right-hand sides after which compiling has saved the time that it took."""
+        return self.compile_s / (self.pinocchio_rhs_s - self.compiled_rhs_s)
 
     def row(self) -> str:
-        """The line of a Markdown table."""
+        """Return the line of the Markdown table."""
         start = (
             f"| {self.name} | {self.n} | {self.operations:,} | {self.bytes / 1e3:,.0f} | {self.expressions_s:.2f} | "
             f"{self.compile_s:.1f} |"
         )
         if self.reason:
             return f"{start} {self.reason} | | | |"
-        gain = self.general_s / self.written_s
-        return f"{start} {1e6 * self.written_s:.2f} | {1e6 * self.general_s:.2f} | {gain:.1f} | {self.repaid:.1e} |"
+        gain = self.pinocchio_rhs_s / self.compiled_rhs_s
+        times_us = f"{1e6 * self.compiled_rhs_s:.2f} | {1e6 * self.pinocchio_rhs_s:.2f}"
+        return f"{start} {times_us} | {gain:.1f} | {self.repaid:.1e} |"
 
 
 def measure(name: str) -> Size:
-    """Write, compile and time one mechanism: a shipped name, a number of squares, or ring_n."""
+    """Write, compile and time the terms of one mechanism: a shipped name, a number of squares, or ring_n."""
     with tempfile.TemporaryDirectory() as folder, empty_cache(Path(folder) / "cache"):
         scene = _scene(name, Path(folder))
         mechanism = load_scene_mechanism(load_scene(scene))
         began = _spent()
-        found = TermFunctions.of(mechanism)
-        text = found.c_source()
+        functions = TermFunctions.of(mechanism)
+        text = functions.c_source()
         expressions_s, began = _spent() - began, _spent()
         reason, library = "", None
         try:
@@ -106,7 +107,7 @@ def measure(name: str) -> Size:
             reason = str(error)
         about = (
             mechanism.n,
-            found.functions["acceleration"].n_instructions(),
+            functions.functions["acceleration"].n_instructions(),
             len(text),
             expressions_s,
             _spent() - began,
@@ -118,13 +119,13 @@ def measure(name: str) -> Size:
 
 def _scene(name: str, folder: Path) -> str:
     if name.isdigit():
-        return str(written(Case(int(name), int(name)), folder))
+        return str(write_case(Case(int(name), int(name)), folder))
     kind, _, number = name.partition("_")
     return str(ring(int(number), folder)) if kind == "ring" and number.isdigit() else f"{name}/default"
 
 
 def ring(n: int, folder: Path) -> Path:
-    """Write a ring of n links, a regular polygon, whose hinges turn about z, x, y in turn; return its scene."""
+    """Write a ring of n links, a regular polygon with hinges about z, x, y in turn; return the path of its scene."""
     inertia = '<inertia ixx="0.01" iyy="0.011" izz="0.012" ixy="0.001" ixz="0.0005" iyz="0.0007"/>'
     parts = ['<link name="base"/>']
     for k in range(n):
@@ -155,13 +156,13 @@ def _rhs_s(scene: str, library: Library | None) -> float:
 
 
 def _spent() -> float:
-    """Processor time of this process and of the compilers that have ended, s."""
+    """Return the processor time of this process and of its finished compilers, s."""
     return sum(os.times()[:4])
 
 
 @contextmanager
 def empty_cache(folder: Path) -> Iterator[None]:
-    """Keep compiled terms in a folder that is not there yet, instead of in the user's cache."""
+    """Use a new folder as the cache of compiled terms instead of the user's cache."""
     before = os.environ.get("XDG_CACHE_HOME")
     os.environ["XDG_CACHE_HOME"] = str(folder)
     try:
@@ -173,7 +174,7 @@ def empty_cache(folder: Path) -> Iterator[None]:
 
 
 def main(names: Sequence[str] = ()) -> None:
-    """Print the table of shipped names, numbers of squares and rings."""
+    """Print a Markdown table of shipped mechanisms, rows of squares and rings."""
     print("| N or name | n | operations | text, kB | expressions, s | compiled, s | written, µs | general, µs | gain |"
           " repaid after |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|")  # fmt: skip
     with one_blas_thread():

@@ -1,4 +1,4 @@
-"""Figures of joints that rub and stop, and of motors that share a force, for docs/images."""
+"""Figures of joint friction, stops and redundant motors for docs/images."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from ckc_pin.view.layout import fit_legend, legend_line
 from ckc_pin.view.style import WIDE_WIDTH_IN, assign_colours, axis_label, coordinate_symbol, rate_symbol
 
 RATES = ("theta_1", "theta_3")
-IMPACT = 0.02  # s, of the run: shown by itself
+IMPACT = 0.02  # s: the part of the run with the impact, in its own panel
 PRELOAD = {"left_elbow_joint": 10.0, "right_elbow_joint": -10.0}
 SHOWN = ("left_shoulder_lift_joint", "left_elbow_joint", "right_shoulder_lift_joint", "right_elbow_joint")
 
 
 def draw_friction(path: Path, dpi: float) -> None:
-    """Impact at a stop, and stick-slip at the turns of a tracked swing."""
-    whole = ckc_pin.simulate("five_bar/friction")
+    """Draw an impact at a stop, and stick-slip at the reversals of a tracked swing."""
+    complete = ckc_pin.simulate("five_bar/friction")
     start = ckc_pin.simulate("five_bar/friction", {"t_end": IMPACT, "solver.output_dt": IMPACT / 400})
     figure, (left, right) = plt.subplots(1, 2, figsize=(WIDE_WIDTH_IN, 3.0), width_ratios=(1, 2))
     shown: dict[str, Any] = {}
-    for ax, run in ((left, start), (right, whole)):
+    for ax, run in ((left, start), (right, complete)):
         for name, colour in assign_colours(RATES).items():
             (shown[name],) = ax.plot(run.t, run.v_tree[:, run.column(name)], color=colour, label=rate_symbol(name))
             for begin, end in _sticking(run, name):
@@ -42,30 +42,30 @@ def draw_friction(path: Path, dpi: float) -> None:
 
 
 def _sticking(run: ckc_pin.Run, name: str) -> list[tuple[float, float]]:
-    """When a joint stuck."""
-    found, since = [], None
+    """Return the intervals in which a joint sticks, (start, end) in s."""
+    intervals, since = [], None
     for event in run.events:
         if event["name"] == f"{name} sticks" and since is None:
             since = float(event["t"])
         elif event["name"] == f"{name} slides" and since is not None:
-            found.append((since, float(event["t"])))
+            intervals.append((since, float(event["t"])))
             since = None
-    return found if since is None else [*found, (since, float(run.t[-1]))]
+    return intervals if since is None else [*intervals, (since, float(run.t[-1]))]
 
 
 def draw_preload(path: Path, dpi: float) -> None:
-    """What motors of two_ur5 do in its lift, with and without preload: one motion."""
-    plain, loaded = _lift({}), _lift({"controller.allocation.preload": PRELOAD})
-    if not np.abs(plain.q_tree - loaded.q_tree).max() < 1e-6:
+    """Draw motor torques of two_ur5's lift with and without a preload, which does not change the motion."""
+    unloaded, loaded = _lift({}), _lift({"controller.allocation.preload": PRELOAD})
+    if not np.abs(unloaded.q_tree - loaded.q_tree).max() < 1e-6:
         raise AssertionError("the preload changes the motion")
     figure, ax = plt.subplots(figsize=(WIDE_WIDTH_IN, 3.4))
     shown = []
     for name, colour in assign_colours(SHOWN).items():
-        column = plain.actuated.index(name)
-        shown += ax.plot(plain.t, plain.tau[:, column], color=colour, label=_words(name))
+        column = unloaded.actuated.index(name)
+        shown += ax.plot(unloaded.t, unloaded.tau[:, column], color=colour, label=_words(name))
         ax.plot(loaded.t, loaded.tau[:, column], "--", color=colour)
     preload = legend_line("black", "with the preload", linestyle="--", linewidth=1.5)
-    ax.set(xlabel=axis_label("$t$", "s"), ylabel=axis_label(r"$\tau$", "N m"), xlim=(0, plain.t[-1]),
+    ax.set(xlabel=axis_label("$t$", "s"), ylabel=axis_label(r"$\tau$", "N m"), xlim=(0, unloaded.t[-1]),
            title="Lift by two arms: one motion, without and with a preload of the elbows")  # fmt: skip
     fit_legend(figure, [*shown, preload])
     figure.savefig(path, dpi=dpi)

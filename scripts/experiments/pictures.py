@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/images."""
+"""Make the pictures of docs/images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", *([] if os.ge
 
 
 def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> None:
-    """Playback at a time of the run, without the controls."""
+    """Save a picture of the playback at time t, without the controls."""
     server = play_runs(runs, block=False)
     assert server is not None  # it does not wait
     with server:
@@ -37,7 +37,7 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
 
 
 def main(chromium: Path) -> None:
-    """Playback first, then figures."""
+    """Make the pictures of playback, then the figures."""
     IMAGES.mkdir(parents=True, exist_ok=True)
     tracking = ckc_pin.simulate("five_bar/tracking")
     lift = ckc_pin.simulate("two_ur5/lift")

@@ -1,9 +1,9 @@
-"""The tables of docs/published_robots.md: `ckc import`, `ckc check` and a motion of published robots.
+"""Make the tables of docs/published_robots.md: `ckc import`, `ckc check` and a motion of published robots.
 
     ./scripts/experiment robots FOLDER
 
-FOLDER holds a checkout of each repository below, under the repository's own name, at the commit named there; robots of
-example-robot-data come from its package (pip install example-robot-data). A robot that is not there stops the script.
+FOLDER holds a checkout of each repository below, in a folder of the repository's name, at the commit listed here.
+Robots of example-robot-data come from its package (pip install example-robot-data). A missing robot stops the script.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ PACKAGE = "package://example-robot-data/robots"
 
 @dataclass(frozen=True)
 class Origin:
+    """A repository of robots: its name, its commit and the files to import."""
+
     title: str
     commit: str
     files: tuple[str, ...]
@@ -105,7 +107,7 @@ ORIGINS = (
 
 
 def row(name: str, path: Path) -> str:
-    """Import, check and move one robot."""
+    """Import, check and move one robot; return its line of the table."""
     draft = read(path)
     motors = str(len(draft.actuated)) if draft.actuated else ""
     joints = [spec for spec, _ in draft.joints]
@@ -115,7 +117,7 @@ def row(name: str, path: Path) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file, _ = write(draft, Path(folder))
         try:
-            found = ckc_pin.check(file)
+            checked = ckc_pin.check(file)
         except ckc_pin.MechanismError as error:
             what = str(error).partition("mechanism.toml: ")[2].partition(". Check")[0]
             return _line(name, "yes", "no", motors, *[""] * 6, "; ".join([*remarks, what]))
@@ -124,12 +126,13 @@ def row(name: str, path: Path) -> str:
     except ckc_pin.CkcError as error:
         print(f"{path}: {error}", file=sys.stderr)
         back = "none"
-    numbers = (*(str(x) for x in (found.n, found.rows, found.rank, found.d)), f"{found.mass:.4g}", back)
-    return _line(name, "yes", "yes", motors, *numbers, "; ".join([*remarks, *_remarks(found.warnings)]))
+    numbers = (*(str(x) for x in (checked.n, checked.rows, checked.rank, checked.d)), f"{checked.mass:.4g}", back)
+    return _line(name, "yes", "yes", motors, *numbers, "; ".join([*remarks, *_remarks(checked.warnings)]))
 
 
-# what notes and warnings hold, and what becomes of them: {n} names follow the colon, {m} stand before it, {first}
-SHORT = {
+# Part of a note or warning -> its short form. {n}: number of names after the colon; {m}: number of names before it;
+# {first}: the text before it.
+REMARKS = {
     "point_2d for loop": "point_2d guessed ({m})",
     "hinge for loop": "hinge guessed ({m})",
     "point for loop": "point guessed ({m})",
@@ -152,12 +155,12 @@ SHORT = {
 
 
 def _remarks(notes: Iterable[str]) -> list[str]:
-    found = []
+    remarks = []
     for note in notes:
-        short = next((short for long, short in SHORT.items() if long in note), "")
+        short = next((short for long, short in REMARKS.items() if long in note), "")
         first, _, names = note.partition(":")
-        found.append(short.format(n=names.count(",") + 1, m=first.count(",") + 1, first=first.partition(", not")[0]))
-    return list(dict.fromkeys(filter(None, found)))
+        remarks.append(short.format(n=names.count(",") + 1, m=first.count(",") + 1, first=first.partition(", not")[0]))
+    return list(dict.fromkeys(filter(None, remarks)))
 
 
 def _line(*cells: str) -> str:

@@ -1,4 +1,4 @@
-"""Published robots in motion: torques by inverse dynamics, fed back, make the motion that they are for."""
+"""Move published robots: torques from inverse dynamics, applied in a run, reproduce the motion."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ckc_pin.formats.importing import Draft, write
 
 __all__ = ["given_back"]
 
-T_END = 0.005  # s; open loop, light rods under large forces leave their motion within ms, by rounding alone
-RATE = 1 / T_END  # rad/s: what swings does not turn round
+T_END = 0.005  # s; without feedback, rounding makes light rods under large forces diverge within milliseconds
+RATE = 1 / T_END  # rad/s: no coordinate reverses within T_END
 SIZE = 0.01  # rad, or of the mechanism's size
 AWAY = 0.3  # rad, or of the mechanism's size: from a singular configuration
 STEPS = 100
@@ -33,7 +33,7 @@ solver = {{output_dt = {T_END / STEPS}, rtol = 1e-12, atol = 1e-14}}
 
 @dataclass(frozen=True)
 class _Torques:
-    """Torques over time, whatever the state."""
+    """Controller that applies torques as a function of time only."""
 
     table: Table
 
@@ -42,20 +42,20 @@ class _Torques:
 
 
 def given_back(draft: Draft) -> float:
-    """Find how far the torques of a motion give it back.
+    """Return how well the torques from inverse dynamics reproduce a motion.
 
-    Every independent coordinate swings and has a motor; on a free root, which none drives, motors push as they
-    would for that. Ranges are not stops.
+    Every independent coordinate swings and has a motor. A free root has no motor; there, the motors push as they would
+    to swing alone. Joint ranges are not stops.
 
     Returns
     -------
     float
-        Largest difference of coordinates, in units of the largest or of 1, and of rates.
+        Largest difference of coordinates and rates, relative to the largest value or to 1.
 
     Raises
     ------
     CkcError
-        It has no motion, or not to the end.
+        There is no such motion, or a run stops before its end.
     """
     drawn = draft.build_mechanism()
     numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.step_scale * drawn.freedoms.singular
@@ -86,7 +86,7 @@ def given_back(draft: Draft) -> float:
 
 
 def _swing(mechanism: Mechanism) -> dict[str, Any]:
-    """Overrides of the scene: what the independent coordinates shall do, and how they start."""
+    """Return overrides of the scene: the desired motion and the start of the independent coordinates."""
     tree, names = mechanism.tree, mechanism.independent
     offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.step_scale)
     desired = {name: {"offset": offset[name], "harmonics": [[amplitude[name], RATE, 0.0]]} for name in names}
@@ -97,7 +97,7 @@ def _swing(mechanism: Mechanism) -> dict[str, Any]:
 
 
 def _push(mechanism: Mechanism) -> _Torques:
-    """What would make each motor swing alone, all else free to move."""
+    """Return the torques that would make each motor swing with everything else free to move."""
     at = mechanism.assembled
     inertia = at.rho.T @ Terms(mechanism, at, np.zeros(mechanism.n)).D_tree @ at.rho
     moved = mechanism.motors.transmission @ at.rho

@@ -1,7 +1,8 @@
-"""Crossing positions where J loses rank: the N-four-bar lies flat every half turn, and N ranks are lost there.
+"""Run through positions where J loses rank: the N-four-bar lies flat every half turn, where J loses N ranks.
 
-Each run is compared with the closed form, all rods at one angle: theta_ddot = -k cos(theta). A run is right if the
-first top pin is within 1e4 rtol and 1e-4 m after ten seconds, stopped if it says so (exit code 3), and wrong otherwise.
+Each run is compared with the closed form: all rods have one angle, theta_ddot = -k cos(theta). A run is "right" if the
+first top pin is within 1e4 rtol and 1e-4 m after ten seconds, "stopped" if it ends with exit code 3, and otherwise
+"wrong".
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ G = 9.81
 
 @dataclass(frozen=True)
 class Crossing:
-    """One run.
+    """Result of one run.
 
     Attributes
     ----------
@@ -46,14 +47,14 @@ class Crossing:
 
     @property
     def verdict(self) -> Verdict:
-        """Right, stopped, or wrong: done but off."""
+        """Return "right", "stopped", or "wrong" for a finished run with a large error."""
         if self.status != "done":
             return "stopped"
         return "right" if self.error <= min(1e4 * self.rtol, 1e-4) else "wrong"
 
 
 def first_top_pin(N: int, t: float) -> tuple[float, float]:
-    """B0 of the N-four-bar at t by its closed form, metres; from upright, the top pins at +1 m/s."""
+    """Return B0 of the N-four-bar at t by the closed form, m. It starts upright, with the top pins at +1 m/s."""
     from scipy.integrate import solve_ivp
 
     k = G * 3 * (3 * N + 1) / (2 * (4 * N + 1))
@@ -63,7 +64,7 @@ def first_top_pin(N: int, t: float) -> tuple[float, float]:
 
 
 def crossings(loops: Sequence[int], tolerances: Sequence[float], formulation: str = "dae") -> Iterator[Crossing]:
-    """Run every N at every tolerance for ten seconds."""
+    """Run every number of loops at every tolerance for ten seconds."""
     for N in loops:
         for rtol in tolerances:
             overrides = {"mechanism.N": N, "solver.rtol": rtol, "formulation": formulation}
@@ -74,7 +75,7 @@ def crossings(loops: Sequence[int], tolerances: Sequence[float], formulation: st
 
 
 def show(formulation: str, quick: bool) -> None:
-    """Print the table, and how many runs are right, stopped, wrong."""
+    """Print a table of the runs and how many are right, stopped and wrong."""
     loops, tolerances = (LOOPS[:3], TOLERANCES[::3]) if quick else (LOOPS, TOLERANCES)
     verdicts: Counter[str] = Counter()
     print("|  N |    rtol | verdict |      t | error of B0 |   rhs |")

@@ -1,4 +1,4 @@
-"""A table of all shipped scenes: how far a run is off, in units of its tolerance, by SciPy on the same equations."""
+"""Compare the runs of all shipped scenes with SciPy on the same equations, in units of their tolerance."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.scene.scene import list_catalogue
 
 TIGHT = 1e-11
-ALLOWED = 100  # tolerances of a step: what a run adds up to
-# s: NumPy takes a millisecond a right-hand side; and what is chaotic forgets its tolerance later
+ALLOWED = 100  # largest error of a run over the tolerance of a step
+# s: NumPy takes a millisecond per right-hand side, and chaotic motions amplify errors later.
 SPANS = {"andrews": 0.01, "delta": 0.1, "stewart": 0.05, "talos": 0.01, "two_ur5": 0.1}
 SPAN = 0.3
-SMOOTH = 0.1  # rad/s: joints that stick are no function of t and y
+SMOOTH = 0.1  # rad/s: sticking joints are not a function of t and y
 
 
-def off(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
-    """Largest error of q' and v' over a run, by the tolerance and the largest value; and the method of the steps."""
+def relative_error(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
+    """Return the largest error of q' and v' over a run, relative to tolerance and largest value, and the method."""
     run = simulate(scene, overrides)
     problem = as_ivp(scene, overrides)
     rows = np.linspace(0, len(run.t) - 1, 5).astype(int)
-    # the scenes of eq. 8 are stiff in z alone, by 1 / epsilon
+    # Scenes of eq. 8 are stiff in z only, with the rate 1 / epsilon.
     method = "Radau" if overrides.get("spf_coordinates") == "z" or scene.startswith("flyball") else "DOP853"
-    found = solve_ivp(problem.f, (0.0, run.t[-1]), problem.y0, method, t_eval=run.t[rows], rtol=TIGHT, atol=TIGHT / 100)
-    assert found.success, found.message
+    solution = solve_ivp(
+        problem.f, (0.0, run.t[-1]), problem.y0, method, t_eval=run.t[rows], rtol=TIGHT, atol=TIGHT / 100
+    )
+    assert solution.success, solution.message
     error = 0.0
-    for row, y in zip(rows, found.y.T, strict=True):
+    for row, y in zip(rows, solution.y.T, strict=True):
         q_tree = problem.mechanism.tree.to_coordinates(problem.terms(run.t[row], y).q_tree)
         for ours, theirs in ((run.q_tree[row], q_tree), (run.v_tree[row], problem.velocity(run.t[row], y))):
             error = max(error, np.abs(ours - theirs).max() / max(1.0, np.abs(theirs).max()))
@@ -38,7 +40,7 @@ def off(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
 
 
 def main() -> int:
-    """Print the table; return 1 where a run is too far off."""
+    """Print the table; return 1 if an error is too large."""
     print("| scene | " + " | ".join(FORMULATIONS) + " |\n|---|" + "---|" * len(FORMULATIONS))
     bad = 0
     with one_blas_thread():
@@ -49,7 +51,7 @@ def main() -> int:
                 for overrides in FORMULATIONS.values():
                     span = SPANS.get(name, SPAN)
                     try:
-                        error, method = off(
+                        error, method = relative_error(
                             f"{name}/{scene}", {**overrides, **smooth, "t_end": span, "solver.output_dt": span / 20}
                         )
                     except InputError:

@@ -1,1 +1,1 @@
-"""What the site is made from beside its pages: keys, commands and public names, read from the program itself."""
+"""Generate the parts of the site that are read from the program: keys, commands and public names."""

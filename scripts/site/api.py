@@ -1,4 +1,4 @@
-"""The public names, from their docstrings by autodoc: functions first, then classes, then errors."""
+"""API reference from docstrings by autodoc: functions first, then classes, then errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference of the commands with their arguments and options, generated from click."""
+"""Generate the reference of the commands with their arguments and options from click."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A Sphinx domain for keys of files and for commands: entries to find by name or unit in the search."""
+"""Sphinx domain for keys of files, which makes them searchable by name and unit."""
 
 from __future__ import annotations
 
@@ -65,6 +65,6 @@ class CkcDomain(Domain):
         self.data["keys"] |= {key: entry for key, entry in otherdata["keys"].items() if entry[2] in docnames}
 
     def get_objects(self) -> Iterator[tuple[str, str, str, str, str, int]]:
-        """Yield entries; the shown name has the unit, so that a search for rad/s finds what is in rad/s."""
+        """Yield entries. The displayed name has the unit, so that a search for rad/s finds keys in rad/s."""
         for key, (name, unit, docname, anchor) in self.data["keys"].items():
             yield key, f"{name} [{unit}]" if unit else name, "key", docname, anchor, 1

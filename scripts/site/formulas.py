@@ -1,4 +1,4 @@
-"""Formulas as drawings in the page: no font, script or network is needed, and they take the text's colour."""
+"""Render formulas as inline SVG, which needs no font, script or network and has the colour of the text."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SIZE = 17.0  # px
 
 
 def setup_formulas(app: Any) -> None:
-    """Make drawings a renderer that ``html_math_renderer`` can name."""
+    """Register the SVG renderer for ``html_math_renderer``."""
     app.add_html_math_renderer("drawn", (_inline, None), (_block, None))
 
 
 @cache
 def _drawn(latex: str, inline: bool) -> str:
-    """Return a formula as SVG, on its base line."""
-    config.svg2 = False  # glyphs as paths: ids of glyphs that are shared would clash within a page
+    """Return a formula as SVG, aligned to the base line."""
+    config.svg2 = False  # glyphs as paths: ids of shared glyphs would clash within a page
     formula = Latex(latex, size=SIZE, color="currentColor", inline=inline)
     sits = f"vertical-align: {formula.getyofst():.2f}px" if inline else ""
     said = escape(latex, quote=True)

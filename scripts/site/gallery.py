@@ -1,4 +1,4 @@
-"""Gallery page: title, picture and text of each example."""
+"""Generate the gallery page: title, picture and text of each example."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Reference of the keys of a user's files, generated from the typed structures that the program reads them with.
+"""Generate the reference of the keys of a user's files from the typed structures that read them.
 
-Type, bounds and default are the structure's; meaning, unit and example stand in its docstring, in the form of a
-numpydoc `Attributes` section where the unit takes the place of the type, and the last line is an example.
+Type, bounds and default are those of the structure. Meaning, unit and example are in its docstring: a numpydoc
+`Attributes` section with the unit in place of the type, and an example in the last line.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ckc_pin.scene.spec import SceneSpec
 __all__ = ["FILES", "Key", "Table", "markdown", "tables"]
 
 FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec, "sweep": SweepSpec}
-# Tables without a structure of their own: their contents decide which structure is read.
+# Tables without a fixed structure: their contents decide which structure is read.
 OPEN = {(TrackingSpec, "desired"): (HarmonicsSpec, PointPathSpec)}
 # Suffix of the path of such a table.
 PLACES: dict[Any, str] = {HarmonicsSpec: ".COORDINATE"}
@@ -52,7 +52,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a file: its path without the file's name, how TOML heads it, its structure and its keys."""
+    """A table of a file: its path without the file's name, its TOML heading, its structure and its keys."""
 
     path: str
     heading: str
@@ -201,5 +201,5 @@ def _code(text: str) -> str:
 
 
 def _quoted(value: str) -> str:
-    """Write an option as YAML, in which an apostrophe is written twice."""
+    """Quote an option as YAML, with doubled apostrophes."""
     return "'" + value.replace("'", "''") + "'"

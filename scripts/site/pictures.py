@@ -1,4 +1,4 @@
-"""The guide's drawings and the home page's moving picture: ``python -m scripts.site.pictures``."""
+"""Draw the guide's figures and the home page's animation: ``python -m scripts.site.pictures``."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ __all__ = ["main"]
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 BLUE, ORANGE, GREEN = COLOURS[:3]
 FORBIDDEN = {"color": ORANGE, "lw": 2.4}
-FREE = {"color": BLUE, "lw": 1.4, "ls": (0, (4.0, 1.6))}  # told apart without colours, too
-# Which of the moves along e1, e2, a and of the turns about them a type forbids.
+FREE = {"color": BLUE, "lw": 1.4, "ls": (0, (4.0, 1.6))}  # distinguishable without colours
+# Translations along e1, e2, a and rotations about them that each loop type constrains.
 FORBIDS = {
     "point": ("111", "000"), "point_2d": ("110", "000"), "hinge": ("111", "110"), "cylindrical": ("110", "110"),
     "universal": ("111", "010"), "prismatic": ("110", "111"), "weld": ("111", "111"), "distance": ("001", "000"),
 }  # fmt: skip
-AXES = {"e1": np.array([-0.80, -0.42]), "e2": np.array([0.92, -0.24]), "a": np.array([0.0, 1.0])}  # seen from the front
+AXES = {"e1": np.array([-0.80, -0.42]), "e2": np.array([0.92, -0.24]), "a": np.array([0.0, 1.0])}  # front view
 
 
 def rows() -> Any:
-    """The eight loop types, with what each forbids."""
+    """Draw the eight loop types with the motions that each constrains."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 5.0), dpi=100, layout="constrained")
@@ -49,7 +49,7 @@ def rows() -> Any:
 
 
 def _arc(ax: Any, axis: Any, how: Mapping[str, Any]) -> None:
-    """A turn about an axis: an open ellipse across it, with a head."""
+    """Draw a rotation about an axis as an open ellipse with an arrow head."""
     along = axis / np.linalg.norm(axis)
     across = np.array([-along[1], along[0]])
     angle = np.linspace(0.6, 5.4, 40)[:, np.newaxis]
@@ -59,7 +59,7 @@ def _arc(ax: Any, axis: Any, how: Mapping[str, Any]) -> None:
 
 
 def frames() -> Any:
-    """The four-bar of the guide: links, coordinates, and the frames that the loop joins."""
+    """Draw the guide's four-bar: links, coordinates, and the frames that the loop connects."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.4), dpi=100, layout="constrained")
@@ -95,7 +95,7 @@ def frames() -> Any:
 
 
 def pipeline() -> Any:
-    """From files to the three formulations."""
+    """Draw the pipeline from files to the three formulations."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.4, 3.7), dpi=100, layout="constrained")
@@ -123,7 +123,7 @@ def pipeline() -> Any:
 
 @figure_style()
 def moving(path: Path, count: int = 60) -> None:
-    """The five-bar under tracking control, as it moves."""
+    """Write an animation of the five-bar under tracking control."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from PIL import Image
@@ -167,7 +167,7 @@ def moving(path: Path, count: int = 60) -> None:
 
 
 def main() -> None:
-    """Draw all of them."""
+    """Draw all figures."""
     for draw, place in ((rows, "guide/rows.png"), (frames, "guide/frames.png"), (pipeline, "theory/pipeline.png")):
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)

@@ -14,16 +14,16 @@ from scripts.site.gallery import Example, examples
 
 __all__ = ["main", "picture", "run"]
 
-DPI = 150  # a figure of seven inches is somewhat sharper than a page's column
+DPI = 150  # makes a figure of seven inches slightly sharper than a page's column needs
 
 
 def run(example: Example) -> Any:
-    """Run an example in Python and return its figure; what is wrong with it is an AssertionError."""
+    """Run an example in Python and return its figure; raise AssertionError if the example is invalid."""
     return import_module(f"examples.{example.name}").main()
 
 
 def picture(example: Example) -> bytes:
-    """Run an example and return its picture, as PNG: of a notebook the first that it shows."""
+    """Run an example and return its picture as PNG; for a notebook, the first picture of its outputs."""
     if example.path.suffix == ".ipynb":
         return _first_shown(example)
     drawn = BytesIO()

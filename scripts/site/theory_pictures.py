@@ -199,7 +199,7 @@ def _amplified() -> tuple[Any, Any, Any]:
 
 
 def main() -> None:
-    """Draw all of them."""
+    """Draw all figures."""
     for draw in (friction, generated, error_control):
         path = DOCS / "images" / "theory" / f"{draw.__name__}.png"
         with figure_style():

@@ -1,4 +1,4 @@
-"""A folder as a user could have it, runs to be played, and a server of playback that is stopped."""
+"""Fixtures: a user's folder, runs to play, and a playback server that is stopped after the test."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def swing(run: Callable[..., ckc_pin.Run]) -> ckc_pin.Run:
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., ViewServer]]:
-    """play(..., block=False), stopped at the end of the test."""
+    """Return `play_runs` with block=False; its servers are stopped at the end of the test."""
     from ckc_pin.view.player import play_runs
 
     started: list[ViewServer] = []

@@ -1,4 +1,4 @@
-"""A smoke of each experiment: it starts, says what it takes, and answers a part of its question."""
+"""Smoke tests of the experiments: help, a small part of each, and messages for wrong arguments."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 import typer
 
 from scripts.experiments.__main__ import app, main
-from tests.contract.helpers.command import Outcome, called
+from tests.contract.helpers.command import Outcome, run_main
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENTS = tuple(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
-# What takes seconds, and what is then on standard output. The others take longer, or need what is not here.
+# Arguments of a part that takes seconds, and a text in its output. Other experiments take longer or need more programs.
 PARTS = {
     "paper": (["no-singularities"], "**The statement holds with a condition.**"),
     "errata": (["multipliers", "type-1-points"], "## type-1-points"),
@@ -26,29 +26,29 @@ PARTS = {
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }
-WRITES = {"paper", "ensembles"}
-NEEDY = {"map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles"}
+HAS_OUT = {"paper", "ensembles"}
+NOT_RUN = {"map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles"}
 
 
 def run(*arguments: str) -> Outcome:
-    return called(main, "./scripts/experiment", *arguments)
+    return run_main(main, "./scripts/experiment", *arguments)
 
 
-def test_every_experiment_is_here() -> None:
-    assert set(PARTS) | NEEDY == set(EXPERIMENTS)
+def test_all_experiments_are_listed() -> None:
+    assert set(PARTS) | NOT_RUN == set(EXPERIMENTS)
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_part_of_an_experiment(name: str, tmp_path: Path) -> None:
+def test_experiment_runs_in_part(name: str, tmp_path: Path) -> None:
     arguments, says = PARTS[name]
-    options = ["--out", str(tmp_path)] if name in WRITES else []
-    found = run(name, *arguments, *options)
-    assert found.code == 0 or name == "bench", found.err  # a busy machine misses a bound
-    assert says in found.out
+    options = ["--out", str(tmp_path)] if name in HAS_OUT else []
+    result = run(name, *arguments, *options)
+    assert result.code == 0 or name == "bench", result.err  # bench may exceed a bound on a busy machine
+    assert says in result.out
 
 
-def test_the_benchmarks_page_is_made_without_measuring(tmp_path: Path) -> None:
-    """Of a single work: its tables are the committed ones, thinned."""
+def test_benchmark_page_is_written_without_measuring(tmp_path: Path) -> None:
+    """The tables are the committed ones, reduced to a single work."""
     import pandas as pd
 
     source = ROOT / "docs" / "report"
@@ -57,23 +57,23 @@ def test_the_benchmarks_page_is_made_without_measuring(tmp_path: Path) -> None:
         table = pd.read_csv(path)
         table = table[table.work == "swing"] if "work" in table else table
         table.to_csv(tmp_path / path.name, index=False)
-    found = run("benchmark", "--page", "--out", str(tmp_path))
-    assert found.code == 0, found.err
+    result = run("benchmark", "--page", "--out", str(tmp_path))
+    assert result.code == 0, result.err
     assert {path.name for path in tmp_path.glob("*.png")} == {"swing.png", "report.png", "growth.png"}
     assert "](swing.png)" in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_what_an_experiment_takes_is_named_with_an_example(name: str) -> None:
-    found = run(name, "--help")
-    assert found.code == 0
-    assert f"\n  ./scripts/experiment {name}" in found.out.partition("Examples:")[2].replace("\n    ", "\n  ")
+def test_help_of_experiment_has_an_example(name: str) -> None:
+    result = run(name, "--help")
+    assert result.code == 0
+    assert f"\n  ./scripts/experiment {name}" in result.out.partition("Examples:")[2].replace("\n    ", "\n  ")
 
 
-def test_what_a_folder_lacks_is_wrong_input(tmp_path: Path) -> None:
-    found = run("benchmark", "--page", "--out", str(tmp_path))
-    assert (found.code, found.out) == (2, "")
-    assert "about.json" in found.err
+def test_missing_tables_are_wrong_input(tmp_path: Path) -> None:
+    result = run("benchmark", "--page", "--out", str(tmp_path))
+    assert (result.code, result.out) == (2, "")
+    assert "about.json" in result.err
 
 
 @pytest.mark.parametrize(
@@ -84,17 +84,17 @@ def test_what_a_folder_lacks_is_wrong_input(tmp_path: Path) -> None:
         (["stability", "nothing"], ("method", "gain", "long")),
     ],
 )
-def test_a_wrong_name_is_answered_with_the_right_ones(line: list[str], choices: tuple[str, ...]) -> None:
-    found = run(*line)
-    assert (found.code, found.out) == (2, "")
-    assert all(name in found.err for name in choices)
+def test_unknown_name_lists_valid_names(line: list[str], choices: tuple[str, ...]) -> None:
+    result = run(*line)
+    assert (result.code, result.out) == (2, "")
+    assert all(name in result.err for name in choices)
 
 
-def test_the_list_loads_no_experiment() -> None:
-    """In a process of its own, as ./scripts/experiment starts it."""
+def test_help_imports_no_experiment() -> None:
+    """Run in a separate process, as ./scripts/experiment does."""
     command = [sys.executable, "-X", "importtime", "-m", "scripts.experiments", "--help"]
-    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert all(name in found.stdout for name in EXPERIMENTS)
-    loaded = {line.rpartition("|")[2].strip() for line in found.stderr.splitlines()}
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert all(name in result.stdout for name in EXPERIMENTS)
+    loaded = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines()}
     assert "typer" in loaded
     assert loaded.isdisjoint({"numpy", "pandas", "jinja2", "joblib", "pinocchio", "matplotlib"})

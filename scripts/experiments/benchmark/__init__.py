@@ -1,1 +1,1 @@
-"""Error against run time: the same work by every formulation and method here, and by the programs people use."""
+"""Benchmark of error against run time: every formulation and method of ckc_pin, and other programs."""

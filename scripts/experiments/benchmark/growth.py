@@ -1,7 +1,8 @@
-"""How cost grows: with the number of squares in a row, of freedoms, of loops; exponents fitted on log-log scales.
+"""Measure how cost grows with the number of squares in a row, of freedoms and of loops.
 
-The row of squares has one freedom whatever N is. Let go of all its loops but the first, and the freedoms grow; close
-them one by one, and the loops grow while the coordinates stay. Right-hand sides are counted, a right-hand side timed.
+The closed row of N squares has one freedom. With only its first loop closed, the freedoms grow with N. Closing the
+loops one by one lets the loops grow with fixed coordinates. Each case counts right-hand sides and times one of them.
+Exponents are fitted on log-log scales.
 """
 
 from __future__ import annotations
@@ -32,37 +33,37 @@ __all__ = [
     "exponent",
     "measure",
     "motion",
-    "written",
+    "write_case",
 ]
 
-RTOL, T_END = 1e-10, 0.4  # s: before the row lies flat
-LEAN = 1.2  # rad: squares lean, so that at rest they are no equilibrium
+RTOL, T_END = 1e-10, 0.4  # s: ends before the row lies flat
+LEAN = 1.2  # rad: initial lean of the squares, since upright squares are in equilibrium
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "dae": {"formulation": "dae"},
     "reduced": {"formulation": "reduced"},
     "spf, z": {"formulation": "spf", "epsilon": 1e-2, "spf_coordinates": "z"},
 }
-BUDGET = 60.0  # s for a counted run
-STATES, SPACING = 20, 1e-4  # of the motion that a right-hand side is timed at: how many, and s between them
-ROUNDS = 20  # over the states, of which the least counts
+BUDGET = 60.0  # s, for the run that counts right-hand sides
+STATES, SPACING = 20, 1e-4  # number of states at which a right-hand side is timed, and s between them
+ROUNDS = 20  # repetitions over the states; the minimum time counts
 
 
 @dataclass(frozen=True)
 class Case:
-    """A row of N squares of which the first `loops` are closed."""
+    """A row of N squares with its first `loops` loops closed."""
 
     N: int
     loops: int
 
     @property
     def d(self) -> int:
-        """Freedoms: 2 N + 1 coordinates, two rows a loop."""
+        """Number of freedoms: 2 N + 1 coordinates less two rows per loop."""
         return 2 * self.N + 1 - 2 * self.loops
 
 
 @dataclass(frozen=True)
 class Family:
-    """Cases along which one number grows.
+    """Cases along which one quantity grows.
 
     Attributes
     ----------
@@ -93,19 +94,19 @@ FAMILIES = (
 
 @dataclass(frozen=True)
 class Growth:
-    """A case in one formulation.
+    """Measurement of one case in one formulation.
 
     Attributes
     ----------
     family, formulation : str
     x : int
-        What grows along the family.
+        Value of the quantity that grows along the family.
     rhs_s : float or None
-        A right-hand side, s.
+        Time of a right-hand side, s.
     rhs : int or None
-        Right-hand sides of a run of 0.4 s at rtol 1e-10 by DOP853.
+        Number of right-hand sides of a run of 0.4 s at rtol 1e-10 by DOP853.
     reason : str
-        Why there is no number.
+        Why a value is missing; empty otherwise.
     """
 
     family: str
@@ -117,12 +118,17 @@ class Growth:
 
 
 def measure(case: Case, family: Family, formulation: str, overrides: Mapping[str, Any] | None = None) -> Growth:
-    """Time a right-hand side of a case, and count those of a run, all with the terms that every size can have."""
+    """Time a right-hand side of a case and count those of a run, with Pinocchio's terms, which every size has."""
     row = Growth(family.key, formulation, getattr(case, family.along))
-    every = {**FORMULATIONS[formulation], "solver.method": "DOP853", "solver.terms": "pinocchio", **(overrides or {})}
+    scene_overrides = {
+        **FORMULATIONS[formulation],
+        "solver.method": "DOP853",
+        "solver.terms": "pinocchio",
+        **(overrides or {}),
+    }
     try:
         with tempfile.TemporaryDirectory() as folder:
-            ready = prepare(load_scene(written(case, Path(folder)), every))
+            ready = prepare(load_scene(write_case(case, Path(folder)), scene_overrides))
         ready.begin()
         rhs_s = float(ready.loop.seconds(motion(ready.loop), ROUNDS))
         run = run_prepared(ready)
@@ -133,8 +139,8 @@ def measure(case: Case, family: Family, formulation: str, overrides: Mapping[str
     return replace(row, rhs_s=rhs_s, rhs=int(run.stats["rhs"]))
 
 
-def written(case: Case, folder: Path) -> Path:
-    """Write a case as files; return the scene's path."""
+def write_case(case: Case, folder: Path) -> Path:
+    """Write the files of a case; return the path of its scene."""
     text, sources = generate(GeneratorSpec(generator="n_four_bar", N=case.N))
     head, *loops = text.split("[[loop]]")
     *_, point = loops[-1].partition("# The first top pin.")
@@ -154,18 +160,18 @@ def written(case: Case, folder: Path) -> Path:
 
 
 def motion(loop: Any) -> Array:
-    """Return the first states of a started loop's motion by the midpoint rule, so that sigma has something to correct.
+    """Return the first states of a started loop's motion by the midpoint rule, so that sigma needs corrections.
 
     Returns
     -------
     (STATES, 1 + len(y)) array
         Rows of t and y.
     """
-    y, h, found = loop.y, SPACING, []
+    y, h, states = loop.y, SPACING, []
     for k in range(STATES):
-        found.append([k * h, *y])
+        states.append([k * h, *y])
         y = y + h * loop.rhs((k + 0.5) * h, y + 0.5 * h * loop.rhs(k * h, y))
-    return np.array(found)
+    return np.array(states)
 
 
 def exponent(points: Mapping[float, float], whole: bool = False) -> float | None:
@@ -176,8 +182,8 @@ def exponent(points: Mapping[float, float], whole: bool = False) -> float | None
     points : mapping of x to y
         Positive.
     whole : bool
-        Over all x; by default over the upper half of their range on its logarithmic scale, where what does not grow
-        has become small.
+        Whether to fit over all x. By default only the upper half of their logarithmic range is used, where costs
+        that do not grow have become small.
     """
     xs = np.array(sorted(points), dtype=float)
     if len(xs) and not whole:
@@ -188,7 +194,7 @@ def exponent(points: Mapping[float, float], whole: bool = False) -> float | None
 
 
 def every_case(quick: bool) -> Iterator[tuple[Family, Case, str]]:
-    """Family, case, formulation, in the order in which they are measured."""
+    """Yield family, case and formulation in the order of measurement."""
     for family in FAMILIES:
         for case in family.quick if quick else family.cases:
             for formulation in FORMULATIONS:

@@ -1,8 +1,8 @@
-"""What a scene leaves out: modules that its run does not load, terms that its right-hand side does not evaluate.
+"""Measure what a scene saves: modules that its run does not import, terms that its right-hand side does not evaluate.
 
-Each is measured by switching it on: a module imported in a fresh interpreter after a run, a term evaluated in NumPy
-at states of the motion, where everything that the step loop's right-hand side evaluates is there already, beside the
-same right-hand side in NumPy.
+Each saving is measured by adding the part. A module is imported in a fresh interpreter after a run. A term is evaluated
+in NumPy at states of the motion where everything that the right-hand side evaluates is available, and compared with
+the time of the same right-hand side in NumPy.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from ckc_pin.scene.scene import Scene, list_catalogue, load_scene
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 
-MISSING = "the scene itself"  # in the place of a module or term, where it cannot be loaded
-BRIEF = 0.02  # s of a scene's motion: enough to load and evaluate what its run does
-START = "five_bar/swing"  # the run after which a module is switched on
-REPEATS = 3  # fresh interpreters a module
-STATES, SPACING = 20, 1e-4  # of the motion, how many and s between them
-ROUNDS = 8  # over the states
+MISSING = "the scene itself"  # stands for a module or term if the scene cannot be loaded
+BRIEF = 0.02  # s of a scene's motion: enough to import and evaluate everything that its run needs
+START = "five_bar/swing"  # the run after which a module is imported
+REPEATS = 3  # fresh interpreters per module
+STATES, SPACING = 20, 1e-4  # number of states of the motion, and s between them
+ROUNDS = 8  # repetitions over the states
 
 Modules = Mapping[str, tuple[str, str]]
 
-# Module, what its import statement is, what it is for.
+# Module: its import statement and its purpose.
 MODULES: Modules = {
     "meshcat": ("import meshcat", "playback in a browser"),
     "matplotlib": ("import matplotlib.figure, matplotlib.backends.backend_agg", "figures"),
@@ -74,7 +74,7 @@ print(json.dumps([perf_counter() - began, peak() - there]))
 """
 )
 
-Probe = Callable[[Terms, Terms], Any]  # of the state, and of the one before it
+Probe = Callable[[Terms, Terms], Any]  # called with the terms of a state and of the state before it
 
 
 def _sigma(terms: Terms, before: Terms) -> Any:
@@ -85,7 +85,7 @@ def _multipliers(terms: Terms, before: Terms) -> Any:
     return multipliers(terms, np.zeros(terms.mechanism.n), np.zeros(terms.mechanism.n))
 
 
-# Term, the name its evaluation is booked under, and how it is switched on.
+# Term: its name in the step loop's profile, and the function that evaluates it.
 TERMS: dict[str, tuple[str, Probe]] = {
     "C'": ("C_tree", lambda terms, before: terms.C_tree),
     "J̇": ("J_dot", lambda terms, before: terms.J_dot),
@@ -99,23 +99,23 @@ TERMS: dict[str, tuple[str, Probe]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class LeftOut:
-    """A module or a term, and a scene.
+    """Cost of a module or a term in a scene.
 
     Attributes
     ----------
     scene : str
-        Empty for a module's own cost, which is every scene's.
+        Empty for the cost of a module, which is the same for all scenes.
     what : str
     used : bool or None
-        Whether the scene's run loads, its right-hand side evaluates it.
+        Whether the scene's run imports the module or its right-hand side evaluates the term.
     seconds : float or None
-        What it costs to switch it on: a module once, a term beside each right-hand side.
+        Time that it would add: a module once, a term in each right-hand side.
     bytes : int or None
-        Of memory: a module's of peak resident memory, a term's while it is evaluated.
+        Memory: peak resident memory for a module, memory during the evaluation for a term.
     rhs_s : float or None
-        A right-hand side in NumPy, beside which a term was measured.
+        Time of a right-hand side in NumPy, for comparison with a term.
     reason : str
-        Why there is no number.
+        Why a value is missing; empty otherwise.
     """
 
     scene: str
@@ -128,25 +128,25 @@ class LeftOut:
 
 
 def every_scene() -> list[str]:
-    """Names of all shipped scenes."""
+    """Return the names of all shipped scenes."""
     return [f"{name}/{scene}" for name, _, scenes in list_catalogue() for scene in scenes]
 
 
 def module_costs(repeats: int = REPEATS, modules: Modules = MODULES) -> Iterator[LeftOut]:
-    """Measure what each module costs where it is switched on after a run: the least of several interpreters."""
+    """Measure the cost of importing each module after a run, the minimum over several interpreters."""
     for name, (statement, _) in modules.items():
         words = (json.dumps([START, {"t_end": BRIEF}]), statement)
         try:
-            found = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
+            measurements = [json.loads(_interpreter(SWITCHED_ON, *words)) for _ in range(repeats)]
         except CkcError as error:
             yield LeftOut(scene="", what=name, reason=str(error))
             continue
-        spent, memory = (min(column) for column in zip(*found, strict=True))
+        spent, memory = (min(column) for column in zip(*measurements, strict=True))
         yield LeftOut(scene="", what=name, seconds=spent, bytes=max(0, memory))
 
 
 def modules_of(scene: str, modules: Iterable[str] = MODULES) -> Iterator[LeftOut]:
-    """Run a scene's beginning in a fresh interpreter, and see what it has loaded."""
+    """Run the beginning of a scene in a fresh interpreter and yield which modules it has imported."""
     words = (json.dumps([scene, {"t_end": BRIEF}]), json.dumps(list(modules)))
     try:
         loaded = json.loads(_interpreter(LOADED, *words))
@@ -157,12 +157,12 @@ def modules_of(scene: str, modules: Iterable[str] = MODULES) -> Iterator[LeftOut
 
 
 def _interpreter(code: str, *words: str) -> str:
-    """Run code in a fresh interpreter; its last line of output.
+    """Run code in a fresh interpreter and return its last line of output.
 
     Raises
     ------
     CkcError
-        With the last line of its complaint.
+        The code failed; the message is the last line of its error output.
     """
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -171,7 +171,7 @@ def _interpreter(code: str, *words: str) -> str:
 
 
 def terms_of(scene: str, overrides: Mapping[str, Any] | None = None) -> Iterator[LeftOut]:
-    """Measure what each term would cost beside a scene's right-hand side, at states of its motion."""
+    """Measure the time that each term would add to a scene's right-hand side, at states of its motion."""
     try:
         loaded = load_scene(scene, {**(overrides or {}), "t_end": BRIEF})
         evaluated, ivp = _evaluated(loaded), as_ivp(loaded)
@@ -184,7 +184,7 @@ def terms_of(scene: str, overrides: Mapping[str, Any] | None = None) -> Iterator
         row = LeftOut(scene=scene, what=what, used=name in evaluated, rhs_s=rhs_s)
         if name not in evaluated:
             try:
-                spent, memory = _beside(ivp, states, evaluated, probe)
+                spent, memory = _time_probe(ivp, states, evaluated, probe)
             except CkcError as error:
                 row = replace(row, reason=str(error))
             else:
@@ -193,14 +193,14 @@ def terms_of(scene: str, overrides: Mapping[str, Any] | None = None) -> Iterator
 
 
 def _evaluated(scene: Scene) -> set[str]:
-    """Return what the step loop's right-hand sides evaluate: names of terms, as it books them, and sigma."""
+    """Return the names of the terms that the step loop's right-hand sides evaluate, by its profile, and sigma."""
     run = simulate(scene, profile=True)
-    found = set(run.profile)
-    if "C_tree" in found:  # the two are computed in one pass; of rho_dot and C there are products alone
-        found.add("J_dot")
-    if run.stats["newton"] and scene.spec.formulation != "dae":  # whose corrections are the projection's
-        found.add("sigma")
-    return found
+    names = set(run.profile)
+    if "C_tree" in names:  # both are computed in one pass; only products of rho_dot and C are computed
+        names.add("J_dot")
+    if run.stats["newton"] and scene.spec.formulation != "dae":  # corrections of a DAE are the projection's
+        names.add("sigma")
+    return names
 
 
 def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
@@ -209,7 +209,7 @@ def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
     Raises
     ------
     NumericalError
-        It does not go so far.
+        The motion ends before the last state.
     """
     from scipy.integrate import solve_ivp
 
@@ -222,7 +222,7 @@ def _motion(ivp: Ivp) -> list[tuple[float, Array]]:
 
 
 def _rhs_seconds(ivp: Ivp, states: list[tuple[float, Array]]) -> float:
-    """Return the mean time of a right-hand side over the states, s, the least of several rounds."""
+    """Return the mean time of a right-hand side over the states, s, the minimum of several rounds."""
 
     def each() -> None:
         for t, y in states:
@@ -232,8 +232,8 @@ def _rhs_seconds(ivp: Ivp, states: list[tuple[float, Array]]) -> float:
         return min(repeat(each, repeat=ROUNDS, number=1)) / len(states)
 
 
-def _beside(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
-    """Return a probe's mean time over the states, s, the least of several rounds, and its memory, bytes."""
+def _time_probe(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], probe: Probe) -> tuple[float, int]:
+    """Return a probe's mean time over the states, s, the minimum of several rounds, and its memory, bytes."""
     terms: list[Terms] = []
 
     def fresh() -> None:
@@ -256,7 +256,7 @@ def _beside(ivp: Ivp, states: list[tuple[float, Array]], evaluated: set[str], pr
 
 
 def _as_evaluated(ivp: Ivp, t: float, y: Array, evaluated: set[str]) -> Terms:
-    """Return the terms at a state as a right-hand side leaves them: what it evaluates is there."""
+    """Return the terms at a state with everything evaluated that the right-hand side evaluates."""
     terms = ivp.terms(t, y)
     for name in evaluated:
         for owner in (terms, terms.at):

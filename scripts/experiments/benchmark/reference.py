@@ -1,4 +1,4 @@
-"""What is right: a closed form, or two formulations at 1e-13, which tell how right by how well they agree."""
+"""Reference solutions: a closed form, or two formulations at rtol 1e-13, whose difference is the accuracy."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["Reference", "reference"]
 
 TIGHT = 1e-13
 GRAVITY = 9.81
-ROUNDING = 1e-13  # of elliptic functions over some turns
+ROUNDING = 1e-13  # rounding error of the elliptic functions over a few turns
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What a work's motion is at its instants.
+    """Reference solution of a work at its instants.
 
     Attributes
     ----------
     values : (INSTANTS + 1, k) array
-        As `Work.observed` gives them.
+        As returned by `Work.observed`.
     accuracy : float
-        How far it may be off: errors below that are not told apart.
+        Error bound of the values; smaller errors of runs cannot be distinguished.
     how : str
-        Where it is from, a sentence.
+        How it was computed, a sentence.
     """
 
     values: Array
@@ -51,9 +51,9 @@ def reference(work: Work) -> Reference:
     formulations = ("dae", "reduced")
     first, second = (_tight(work, formulation) for formulation in formulations)
     apart = float(np.abs(first - second).max())
-    known, where = _published(work, first)
+    published_error, where = _published(work, first)
     how = f"DAE at {TIGHT:.0e}; the reduced model at {TIGHT:.0e} agrees to {apart:.1e}{where}"
-    return Reference(first, max(apart, known), how)
+    return Reference(first, max(apart, published_error), how)
 
 
 def _tight(work: Work, formulation: str) -> Array:
@@ -66,7 +66,7 @@ def _tight(work: Work, formulation: str) -> Array:
 
 
 def _row_of_squares(work: Work) -> Reference:
-    """N squares in a row keep one angle, theta_ddot = -k cos(theta): a pendulum that turns, by elliptic functions.
+    """Return the closed form of N squares in a row by elliptic functions, a pendulum: theta_ddot = -k cos(theta).
 
     With chi = (pi/2 - theta) / 2, chi_dot = sqrt(1 + 4 k sin(chi)^2) / 2, so that chi = am(t / 2, -4 k).
     """
@@ -95,8 +95,8 @@ ANDREWS = {
 
 def _andrews(work: Work, values: Array) -> tuple[float, str]:
     at = int(np.argmin(np.abs(work.instants - 0.03)))
-    known = np.array([ANDREWS[name] for name in work.mechanism.coordinates])
-    off = float(np.abs(values[at] - known).max())
+    published = np.array([ANDREWS[name] for name in work.mechanism.coordinates])
+    off = float(np.abs(values[at] - published).max())
     return off, f"; at 0.03 s {off:.1e} from the published solution"
 
 
@@ -112,5 +112,5 @@ PUBLISHED: dict[str, Callable[[Work, Array], tuple[float, str]]] = {"andrews": _
 
 
 def _published(work: Work, values: Array) -> tuple[float, str]:
-    """How far the values are from published ones, and that as words; nothing where there are none."""
+    """Return the difference from published values and a sentence on it, (0, "") without published values."""
     return PUBLISHED[work.key](work, values) if work.key in PUBLISHED else (0.0, "")

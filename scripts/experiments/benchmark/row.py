@@ -1,4 +1,4 @@
-"""One measured run of one program: a line of the report's table."""
+"""Compare one run of one program with the reference: a line of the report's table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ckc_pin.dynamics.terms import Terms
 from scripts.experiments.benchmark.reference import Reference
 from scripts.experiments.benchmark.work import Work
 
-__all__ = ["Row", "judged"]
+__all__ = ["Row", "compare_with_reference"]
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Row:
     rhs: int | None
 
 
-def judged(work: Work, program: str, setting: str, motion: Motion, reference: Reference) -> Row:
-    """Measure a motion against the reference: error, closure, energy."""
-    whole = motion.status == "done" and len(motion.q_tree) == len(work.instants)
-    finite = whole and bool(np.all(np.isfinite(motion.q_tree)))
+def compare_with_reference(work: Work, program: str, setting: str, motion: Motion, reference: Reference) -> Row:
+    """Compare a motion with the reference: error, closure and energy drift."""
+    complete = motion.status == "done" and len(motion.q_tree) == len(work.instants)
+    finite = complete and bool(np.all(np.isfinite(motion.q_tree)))
     errors = np.abs(work.observed(motion.q_tree) - reference.values).max(axis=1) if finite else np.empty(0)
-    closure, drift = _kept_closed(work, motion) if finite else (None, None)
+    closure, drift = _closure_and_drift(work, motion) if finite else (None, None)
     return Row(
         work=work.key,
         program=program,
@@ -56,8 +56,8 @@ def judged(work: Work, program: str, setting: str, motion: Motion, reference: Re
     )
 
 
-def _kept_closed(work: Work, motion: Motion) -> tuple[float, float | None]:
-    """Largest |phi|, and how far the energy leaves its value at the start; None where a controller acts."""
+def _closure_and_drift(work: Work, motion: Motion) -> tuple[float, float | None]:
+    """Return the largest |phi| and the relative drift of the energy, None if a controller or damper acts."""
     mechanism = work.mechanism
     states = [
         Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(q_tree)), v_tree)

@@ -1,4 +1,4 @@
-"""What a measurement depends on beside its setting: code, versions, machine. A changed line makes old ones stale."""
+"""Cache keys of measurements: hashes of code, versions and machine. A changed line of code makes old entries stale."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PACKAGES = ("pin", "numpy", "scipy")
 
 
 def stamp(*content: Any) -> str:
-    """Return a hash of plain data, the package's code, the versions and the machine."""
+    """Return a hash of JSON-like data, the package's code, the versions and the machine."""
     return str(joblib.hash([*content, _code(), versions(), machine()]))
 
 
 def work_stamp(work: Work, version: str = "") -> str:
-    """Return a hash of what a run of a work depends on: scene, texts, code, versions, machine."""
+    """Return a hash of everything that a run of a work depends on: scene, texts, code, versions, machine."""
     scene = work.load()
     return stamp(scene.to_dict(), {**work.mechanism.sources.texts, **scene.sources.texts}, version, work.terms)
 
@@ -45,7 +45,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def machine() -> str:
-    """Return the processor and how many of it."""
+    """Return the name of the processor and the number of cores."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

@@ -1,4 +1,4 @@
-"""What is measured: motions of shipped mechanisms, and what is compared at which instants."""
+"""Works of the benchmark: motions of shipped mechanisms, with the quantities and instants of the comparison."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ INSTANTS = 10  # at which motions are compared, the end among them
 
 @dataclass(frozen=True)
 class Budget:
-    """Seconds that one run may take, here and in the other programs."""
+    """Time budget of one run, s, in ckc_pin and in the other programs."""
 
-    own: float
+    ours: float
     peer: float
 
 
@@ -37,18 +37,18 @@ class Work:
     ----------
     key : str
     says : str
-        In a few words.
+        Title in a few words.
     scene : str
     t_end : float
         s.
     overrides : mapping
         Values of the scene by dotted key.
     point : str or None
-        The mechanism's point whose position is compared; None: all coordinates.
+        Name of the mechanism's point whose position is compared; None compares all coordinates.
     quick : bool
-        Part of the quick report.
+        Whether it is part of the quick report.
     planar : bool
-        All moves in one plane.
+        Whether everything moves in one plane.
     """
 
     key: str
@@ -62,9 +62,9 @@ class Work:
 
     def load(self, **solver: Any) -> Scene:
         """Return the scene, with values of its solver and formulation: load(formulation="dae", solver__rtol=1e-6)."""
-        own = {name.replace("__", "."): value for name, value in solver.items()}
+        overrides = {name.replace("__", "."): value for name, value in solver.items()}
         return load_scene(
-            self.scene, {**self.overrides, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **own}
+            self.scene, {**self.overrides, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **overrides}
         )
 
     @cached_property
@@ -74,7 +74,7 @@ class Work:
 
     @cached_property
     def terms(self) -> str:
-        """What the mechanism is run with: terms written out, compiled here if need be, or Pinocchio's."""
+        """Terms of the runs: "generated" (compiled here if necessary) or, for large trees, "pinocchio"."""
         try:
             compile_terms(self.mechanism)
         except InputError:
@@ -88,16 +88,16 @@ class Work:
 
     @cached_property
     def epsilon(self) -> float:
-        """Of the singular perturbation formulation."""
+        """Epsilon of the singular perturbation formulation."""
         return float(self.load().spec.epsilon)
 
     @property
     def instants(self) -> Array:
-        """When motions are compared, shape (INSTANTS + 1,), the start included, s."""
+        """Times at which motions are compared, s, shape (INSTANTS + 1,), with the start."""
         return np.linspace(0.0, self.t_end, INSTANTS + 1)
 
     def observed(self, q_tree: Array) -> Array:
-        """What is compared of configurations by coordinate, (m, n): themselves, or (m, 3) positions of the point."""
+        """Return the compared quantities of (m, n) coordinates: the coordinates, or (m, 3) positions of the point."""
         if self.point is None:
             return q_tree
         from_coordinates, positions = self.mechanism.tree.from_coordinates, self.mechanism.point_positions

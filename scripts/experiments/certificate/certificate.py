@@ -28,7 +28,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start
 from scripts.experiments.certificate.branch_walk import Border, find_minimum, follow, margin, same_configuration
 from scripts.experiments.certificate.exploration import Explored, explore
-from scripts.experiments.certificate.gradient_bounds import symmetric_least
+from scripts.experiments.certificate.gradient_bounds import min_symmetric_eigenvalue
 
 __all__ = ["Certificate", "SublevelSet", "certify", "level_of", "rest_height", "sublevel_set"]
 
@@ -51,10 +51,10 @@ class Certificate:
         One sentence.
     level : float
         V_L at the start, J.
-    least_eigenvalue : float
+    smallest_eigenvalue : float
         Of K_P + sym dh/dq on the set, N m/rad between angles; NaN where the set reaches a singular
         configuration, at which h has no derivative.
-    least_margin : float
+    smallest_margin : float
         Least |s| on the set, see `scripts.experiments.certificate.branch_walk.margin`.
     safe_level : float
         Largest level, J, at which the set around q_d satisfies the conditions, by the lattice; at most `level`.
@@ -70,8 +70,8 @@ class Certificate:
     status: Status
     reason: str
     level: float
-    least_eigenvalue: float
-    least_margin: float
+    smallest_eigenvalue: float
+    smallest_margin: float
     safe_level: float
     worst_q: Array
     sampled: bool
@@ -166,8 +166,8 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
         else "not certified",
         reason=search.reason(singular, tight, soft, start),
         level=level,
-        least_eigenvalue=np.nan if singular else search.stiffness(soft),
-        least_margin=0.0 if singular else margin(tight),
+        smallest_eigenvalue=np.nan if singular else search.stiffness(soft),
+        smallest_margin=0.0 if singular else margin(tight),
         safe_level=safe_level,
         worst_q=mechanism.independent_part(worst.q_tree),
         sampled=sublevel.explored.sampled,
@@ -288,4 +288,4 @@ class _Search:
 
 
 def _stiffness(mechanism: Mechanism, controller: SetPoint, at: Kinematics) -> float:
-    return symmetric_least(controller.K_P + h_gradient(mechanism, at))
+    return min_symmetric_eigenvalue(controller.K_P + h_gradient(mechanism, at))

@@ -21,7 +21,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from scripts.experiments.certificate.branch_walk import Border, find_minimum, follow, margin, wrapped_difference
 from scripts.experiments.certificate.exploration import Explored, explore
 
-__all__ = ["Bound", "bound_along", "chart_step", "explore_branch", "gradient_bounds", "symmetric_least"]
+__all__ = ["Bound", "bound_along", "chart_step", "explore_branch", "gradient_bounds", "min_symmetric_eigenvalue"]
 
 STARTS = 2  # of local searches
 MIN_START_DISTANCE = 2  # between them, steps of the lattice
@@ -60,7 +60,7 @@ class Bound:
     sampled: bool
 
 
-def symmetric_least(matrix: Array) -> float:
+def min_symmetric_eigenvalue(matrix: Array) -> float:
     """Return the smallest eigenvalue of the symmetric part of a matrix."""
     return float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[0])
 
@@ -176,7 +176,7 @@ def _minus_norm(mechanism: Mechanism, at: Kinematics) -> float:
 
 
 def _low(mechanism: Mechanism, at: Kinematics) -> float:
-    return symmetric_least(h_gradient(mechanism, at))
+    return min_symmetric_eigenvalue(h_gradient(mechanism, at))
 
 
 def _bound(mechanism: Mechanism, s_min: float, norm: Kinematics, low: Kinematics, points: int, sampled: bool) -> Bound:

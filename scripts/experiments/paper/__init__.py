@@ -1,1 +1,1 @@
-"""The paper, statement by statement, and its errata."""
+"""Experiments on the paper's statements and its errata."""

@@ -1,4 +1,4 @@
-"""The boundary layer of the SPF: eq. 12 in fast time, eq. 13's eigenvalues, and what the layer does to q_dot.
+"""Boundary layer of the SPF: eq. 12 in fast time, the eigenvalues of eq. 13, and the jump of q_dot across the layer.
 
 Eq. 12, dy/dtau = -phi_z^-1 phi at a frozen q, is Newton's method in continuous time: phi decays as
 exp(-tau) exactly, so its solution is z on the level set phi = w(0) exp(-tau), and no integration is needed.
@@ -48,7 +48,7 @@ def solve_eq_12(mechanism: Mechanism, at: Kinematics, w: Array, taus: Array) -> 
     ----------
     mechanism : Mechanism
     at : Kinematics
-        On phi = 0; its q stays, its z is h.
+        Configuration on phi = 0. Its q is kept, its z is h.
     w : (rows,) array
     taus : (m,) array
         Fast time t / epsilon, increasing.
@@ -56,7 +56,7 @@ def solve_eq_12(mechanism: Mechanism, at: Kinematics, w: Array, taus: Array) -> 
     Raises
     ------
     NumericalError
-        There is no such y on this branch.
+        This branch has no such y.
     """
     ys = []
     off = on_level(mechanism, at, w)
@@ -71,7 +71,7 @@ def _y(mechanism: Mechanism, on: Kinematics, off: Kinematics) -> Array:
 
 
 def eq_13(at: Kinematics) -> Array:
-    """Gradient by y of eq. 12's right-hand side, -phi_z^-1 phi, at any z, shape (n - d, n - d).
+    """Return the gradient by y of eq. 12's right-hand side, -phi_z^-1 phi, at any z, shape (n - d, n - d).
 
     With s = phi_z^-1 phi it is -I + phi_z^-1 (d phi_z / dz)[s]: the identity's negative where phi = 0, in every
     configuration. The second derivatives of phi are symmetric, so that (d phi_z / dz)[s] is J_dot along
@@ -84,7 +84,7 @@ def eq_13(at: Kinematics) -> Array:
 
 
 def directions(rows: int, count: int) -> Array:
-    """Unit vectors in the space of w: evenly round the circle for two rows, else a fixed random sample."""
+    """Return unit vectors in the space of w: evenly spaced for two rows, otherwise a fixed random sample."""
     if rows == 2:
         angle = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
         return np.column_stack([np.cos(angle), np.sin(angle)])
@@ -93,25 +93,25 @@ def directions(rows: int, count: int) -> Array:
 
 
 def eigenvalues_around(mechanism: Mechanism, at: Kinematics, radius: float, count: int = 16) -> Array:
-    """Eigenvalues of `eq_13` at the z with the same q on phi = w, for `count` directions of |w| = radius.
+    """Return eigenvalues of `eq_13` at the z with the same q on phi = w, for `count` directions of |w| = radius.
 
     Returns
     -------
     (count, n - d) complex array
-        NaN where the branch has no such z.
+        NaN if the branch has no such z.
     """
     q = mechanism.independent_part(at.q_tree)
     values = np.full((count, len(at.partition.z)), np.nan, dtype=complex)
     for k, direction in enumerate(directions(mechanism.closure.rows, count)):
-        found = sigma(mechanism, q, at, radius * direction)
-        if found.verdict == "converged":
-            values[k] = np.linalg.eigvals(eq_13(found.at))
+        closed = sigma(mechanism, q, at, radius * direction)
+        if closed.verdict == "converged":
+            values[k] = np.linalg.eigvals(eq_13(closed.at))
     return values
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The layer as eq. 12 has it and as runs of the SPF show it.
+    """The boundary layer by eq. 12 and as measured in runs of the SPF.
 
     Attributes
     ----------
@@ -147,12 +147,12 @@ class Layer:
 def measured_layer(
     problem: Problem, w: Array, epsilons: Sequence[float], taus: Array, convention: CoriolisVelocity = "rho"
 ) -> Layer:
-    """Run the SPF and the DAE through the layer, taus[0] = 0, and put them beside eq. 12.
+    """Run the SPF and the DAE through the layer, with taus[0] = 0, for comparison with eq. 12.
 
     Raises
     ------
     NumericalError
-        A run that stops, or a start that does not exist.
+        A run stops, or the start does not exist.
     """
     measured = []
     for epsilon in epsilons:
@@ -164,12 +164,12 @@ def measured_layer(
 
 
 def problem_after_layer(problem: Problem, w: Array) -> Problem:
-    """Return the problem whose DAE the SPF approaches when C takes the actual z_dot (eq. 16).
+    """Return the problem whose DAE is the limit of the SPF if C is evaluated at the actual z_dot (eq. 16).
 
-    C is linear in the velocity, so that z_dot = -phi_z^-1 phi / epsilon puts a term of 1 / epsilon into q_ddot
-    for a time of epsilon. In the limit q stays where it is through the layer and
-    dq_dot/dtau = -D^-1 C(q, z, -phi_z^-1 phi) q_dot: q_dot leaves the layer with another value (and, D_dot - 2 C
-    being skew along this flow, with the same kinetic energy).
+    C is linear in the velocity. So z_dot = -phi_z^-1 phi / epsilon adds a term of order 1 / epsilon to q_ddot for a
+    time of order epsilon. In the limit q is constant through the layer and
+    dq_dot/dtau = -D^-1 C(q, z, -phi_z^-1 phi) q_dot. So q_dot jumps across the layer. Its kinetic energy does not,
+    since D_dot - 2 C is skew-symmetric along this flow.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def problem_after_layer(problem: Problem, w: Array) -> Problem:
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer what the paper claims of the boundary layer and of its eigenvalues."""
+    """Answer the paper's claims on the boundary layer and its eigenvalues."""
     problem = five_bar_problem(True)
     return [_layer_claim(measured_layer(problem, W0, EPSILONS, TAUS), figures), _eigenvalue_claim(problem, figures)]
 

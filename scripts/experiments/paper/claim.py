@@ -1,4 +1,4 @@
-"""A statement of the paper with the experiment that answers it."""
+"""A statement of the paper with the result of its experiment."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ class Claim:
     where : str
         Where the paper says it, e.g. "section II-A, eq. 13".
     says : str
-        What it says, in a sentence.
-    found : str
-        What was measured, with its numbers.
+        The statement, a sentence.
+    measured : str
+        Results of the experiment, with numbers.
     verdict : Verdict
     commands : tuple of str
-        What else a reader can run to see it; ``./scripts/experiment paper KEY`` always shows it.
+        Further commands that show the result, besides ``./scripts/experiment paper KEY``.
     figures : tuple of str
         File names in the page's folder of figures.
     table : (header, rows) or None
-        Numbers worth a table; cells are strings.
+        Table of results; cells are strings.
     """
 
     key: str
     where: str
     says: str
-    found: str
+    measured: str
     verdict: Verdict
     commands: tuple[str, ...] = ()
     figures: tuple[str, ...] = ()

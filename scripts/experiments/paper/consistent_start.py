@@ -1,6 +1,7 @@
-"""From a consistent start, w(0) = 0, the SPF is the DAE for every epsilon: only the integration's error is left.
+"""From a consistent start, w(0) = 0, SPF and DAE have the same solution for every epsilon.
 
-Eq. 8 gives dphi/dt = -phi/epsilon exactly, so that phi = 0 stays 0, and on phi = 0 its first line is eq. 6.
+Eq. 8 gives dphi/dt = -phi/epsilon exactly, so that phi stays zero, and on phi = 0 its first line is eq. 6. Measured
+differences are integration errors only.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Irrelevance:
     eq_17 : (k,) array
         Eq. 17 by DOP853, for each epsilon.
     radau, dop853 : float
-        What the same two methods make of the reduced model, in which there is no epsilon.
+        The same for the reduced model, which has no epsilon, by the same two methods.
     """
 
     rtol: float
@@ -59,7 +60,7 @@ def measure(
     Raises
     ------
     NumericalError
-        A run that stops.
+        A run stops.
     """
     dae = end_of(problem.dae(), "DOP853", 1e-12, t_end)
     none = np.zeros(problem.mechanism.closure.rows)
@@ -73,48 +74,48 @@ def measure(
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer what epsilon changes from a consistent start."""
-    found = [measure(five_bar_problem(True), rtol) for rtol in RTOLS]
-    name = _draw(found, figures)
-    worst = max(float((each.printed / each.radau).max()) for each in found)
-    same = all(bool(np.all(each.eq_17 == each.dop853)) for each in found)
+    """Answer whether epsilon matters from a consistent start."""
+    studies = [measure(five_bar_problem(True), rtol) for rtol in RTOLS]
+    name = _draw(studies, figures)
+    worst = max(float((each.printed / each.radau).max()) for each in studies)
+    same = all(bool(np.all(each.eq_17 == each.dop853)) for each in studies)
     return [
         Claim(
             key="epsilon-irrelevant",
             verdict="does not hold" if same and worst < 10 else "holds",
             figures=(name,),
-            table=_table(found),
+            table=_table(studies),
             **said(
                 "claims/epsilon-irrelevant",
                 t_end=T_END,
-                largest=[each.printed.max() for each in found],
+                largest=[each.printed.max() for each in studies],
                 printed=(PRINTED[0], PRINTED[-1]),
-                rtols=[each.rtol for each in found],
+                rtols=[each.rtol for each in studies],
                 worst=worst,
                 same=same,
-                least=EQ_17[-1],
+                smallest=EQ_17[-1],
             ),
         )
     ]
 
 
-def _table(found: Sequence[Irrelevance]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+def _table(studies: Sequence[Irrelevance]) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
     heads = ["ε"]
-    for each in found:
+    for each in studies:
         heads += [f"eq. 8: rtol {each.rtol:.0e}", f"eq. 17: rtol {each.rtol:.0e}"]
     rows = []
     for k, epsilon in enumerate(EQ_17):
         cells = [f"{epsilon:.0e}"]
-        for each in found:
+        for each in studies:
             cells += [f"{each.printed[k]:.1e}" if k < len(PRINTED) else "", f"{each.eq_17[k]:.1e}"]
         rows.append(tuple(cells))
-    rows.append(("reduced", *(f"{x:.1e}" for each in found for x in (each.radau, each.dop853))))
+    rows.append(("reduced", *(f"{x:.1e}" for each in studies for x in (each.radau, each.dop853))))
     return tuple(heads), tuple(rows)
 
 
-def _draw(found: Sequence[Irrelevance], figures: Path) -> str:
+def _draw(studies: Sequence[Irrelevance], figures: Path) -> str:
     figure, (ax,) = chart()
-    for each, colour in zip(found, COLOURS, strict=False):
+    for each, colour in zip(studies, COLOURS, strict=False):
         ax.loglog(PRINTED, each.printed, "o-", color=colour, label=f"eq. 8, Radau, rtol {each.rtol:.0e}")
         ax.loglog(EQ_17, each.eq_17, "s--", color=colour, label=f"eq. 17, DOP853, rtol {each.rtol:.0e}", markersize=4)
     ax.loglog(EQ_17, EQ_17, ":", color=BLACK, label="ε, the bound off the manifold")

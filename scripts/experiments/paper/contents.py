@@ -1,10 +1,10 @@
-"""What the page on the paper has: sections and claims in the paper's order, and the module that answers each."""
+"""Contents of the page on the paper: sections and claims in the paper's order, and the module of each claim."""
 
 from __future__ import annotations
 
 __all__ = ["KEYS", "SECTIONS", "STUDIES"]
 
-# Which module of this room answers what; those that take longest come first.
+# The claims that each module of this package answers. The slowest modules come first.
 STUDIES: dict[str, tuple[str, ...]] = {
     "tracking": ("tracking-lyapunov", "tracking-skew", "tracking-gains", "tracking-deviations"),
     "cost_claims": ("cost",),

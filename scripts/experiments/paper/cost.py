@@ -1,8 +1,8 @@
-"""What the formulations cost at equal error (section III-B): eq. 8 as printed, the reduced model, the DAE.
+"""Cost of the formulations at equal error (section III-B): eq. 8 as printed, the reduced model, the DAE.
 
-All are marched in NumPy by SciPy's methods, so that nothing but the equations differs. For each method the loosest
-of a list of tolerances is taken whose run ends within `TARGET` of the DAE integrated at 1e-12; its counts and its
-processor time are the cost. All start on phi = 0, so that epsilon changes what eq. 8 costs and nothing else.
+All are integrated in NumPy by SciPy's methods, so that only the equations differ. For each method, the loosest
+tolerance of a list is chosen whose run ends within `Search.target` of the DAE integrated at 1e-12. The counts and the
+processor time of that run are the cost. All runs start on phi = 0, where epsilon affects only the cost of eq. 8.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ __all__ = ["EPSILONS", "METHODS", "Cost", "Search", "cheapest", "cost_at_equal_e
 
 METHODS = ("DOP853", "Radau", "BDF", "LSODA")
 EPSILONS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-REPEATS, LONG = 2, 0.3  # runs shorter than LONG seconds are made so often; the least time counts
+REPEATS = 2  # repetitions of short runs, of which the minimum time counts
+MAX_REPEATED_RUN_S = 0.3  # runs that take longer are not repeated
 
 
 @dataclass(frozen=True)
 class Search:
-    """What counts as equal error, and how much may be spent on it.
+    """Definition of equal error, and the budget of a run.
 
     Attributes
     ----------
     rtols : tuple of float
-        Falling.
+        Decreasing tolerances.
     target : float
         Largest error in (q, q_dot) and z at the end.
     max_rhs : int
@@ -45,7 +46,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Cost:
-    """A formulation and method at the loosest tolerance that reaches the target, or why there is none.
+    """Cost of a formulation and method at the loosest tolerance that reaches the target, or why there is none.
 
     Attributes
     ----------
@@ -53,10 +54,10 @@ class Cost:
     epsilon : float or None
     method : str
     rtol, error : float
-        Of that run; NaN without one.
+        Tolerance and error of that run; NaN without one.
     outcome : Outcome or None
     reason : str
-        Why no run reaches the target; empty when one does.
+        Why no run reaches the target; empty if one does.
     """
 
     formulation: str
@@ -73,28 +74,28 @@ class Cost:
         return self.outcome.seconds if self.outcome else float("nan")
 
     def count(self, name: str) -> int:
-        """One of the outcome's counts; 0 without a run."""
+        """Return one of the outcome's counts, 0 without a run."""
         return self.outcome.stats[name] if self.outcome else 0
 
 
 def cost_at_equal_error(
     name: Cost, make: Callable[[], Ivp], reference: Terms, t_end: float, search: Search, first: float
 ) -> Cost:
-    """Find the loosest tolerance that reaches the target and what its run costs.
+    """Find the loosest tolerance that reaches the target, and the cost of its run.
 
     Parameters
     ----------
     name : Cost
-        Says which formulation, epsilon and method.
+        Its formulation, epsilon and method are used.
     make : callable
-        Gives the initial value problem, fresh for each run.
+        Returns a new initial value problem for each run.
     reference : Terms
         The exact state at t_end.
     t_end : float
     search : Search
     first : float
-        The tolerance to begin with: from there looser ones while they reach the target, or tighter ones
-        until one does or the budget is used up.
+        First tolerance to try. If it reaches the target, looser ones follow while they do. Otherwise tighter ones
+        follow until one reaches it or the budget is exhausted.
     """
 
     def attempt(k: int) -> Cost:
@@ -122,7 +123,7 @@ def _out_of_budget(cost: Cost) -> bool:
 
 
 def _timed(cost: Cost, make: Callable[[], Ivp], t_end: float) -> Cost:
-    if cost.outcome is None or cost.outcome.seconds > LONG:
+    if cost.outcome is None or cost.outcome.seconds > MAX_REPEATED_RUN_S:
         return cost
     runs = [cost.outcome, *(march(make(), cost.method, cost.rtol, t_end) for _ in range(REPEATS - 1))]
     return replace(cost, outcome=min(runs, key=lambda run: run.seconds))
@@ -135,27 +136,27 @@ def study(
     methods: Sequence[str] = METHODS,
     search: Search | None = None,
 ) -> list[Cost]:
-    """Measure the reduced model, the DAE, and eq. 8 for each epsilon with each method.
+    """Measure the cost of the reduced model, the DAE, and eq. 8 for each epsilon, with each method.
 
-    An epsilon smaller than one at which a method used up its budget is not tried with it.
+    After a method has exhausted its budget at one epsilon, it is not tried with smaller ones.
 
     Parameters
     ----------
     problem : Problem
     t_end : float
     epsilons : sequence of float
-        Falling.
+        Decreasing tolerances.
     methods : sequence of str
     search : Search, optional
 
     Raises
     ------
     NumericalError
-        The reference does not exist.
+        The reference cannot be computed.
     """
     search = search or Search()
     reference = end_of(problem.dae(), "DOP853", 1e-12, t_end)
-    for ivp in (problem.printed_spf(1e-2), problem.reduced()):  # imports and caches are nobody's cost
+    for ivp in (problem.printed_spf(1e-2), problem.reduced()):  # imports and caches are filled before the timing
         march(ivp, "DOP853", 1e-3, min(t_end, 0.1))
     return [
         cost for method in methods for cost in _costs_of_method(problem, method, epsilons, reference, t_end, search)
@@ -177,7 +178,7 @@ def _costs_of_method(
             costs.append(replace(name, reason=spent))
             continue
         cost = cost_at_equal_error(name, make, reference, t_end, search, rtol)
-        rtol = rtol if cost.reason else cost.rtol  # the next one will need much the same
+        rtol = rtol if cost.reason else cost.rtol  # the next epsilon needs about the same tolerance
         if name.epsilon is not None and _out_of_budget(cost):
             spent = f"not tried: too much at epsilon = {name.epsilon:.0e} already"
         costs.append(cost)
@@ -185,6 +186,6 @@ def _costs_of_method(
 
 
 def cheapest(costs: Sequence[Cost], formulation: str, epsilon: float | None = None) -> Cost:
-    """Return the cost of least time of a formulation, over the methods that reached the target."""
+    """Return the smallest cost in time of a formulation over the methods that reach the target."""
     those = [c for c in costs if c.formulation == formulation and c.epsilon == epsilon and not c.reason]
     return min(those, key=lambda cost: cost.seconds)

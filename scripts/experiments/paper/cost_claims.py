@@ -1,4 +1,4 @@
-"""The paper's sentence on cost (section III-B), answered with both sides counted."""
+"""Answer the paper's statement on cost (section III-B), with the costs of both formulations."""
 
 from __future__ import annotations
 
@@ -17,44 +17,44 @@ __all__ = ["claims", "cost_claim"]
 
 SCENES = {"five_bar/swing": 2.0, "five_bar/tracking": 3.0}  # and t_end, s
 PAPER = (1e-3, 1e-4)  # the paper's epsilons
-CHEAPER = 0.9  # of the reduced model's time: less counts as saved
+CHEAPER = 0.9  # share of the reduced model's time below which eq. 8 counts as cheaper
 
-Found = Mapping[str, Sequence[Cost]]
+Costs = Mapping[str, Sequence[Cost]]
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer what the paper says of the cost of the reduced model against the SPF."""
+    """Answer the paper's statement on the cost of the reduced model against the SPF."""
     return [
         cost_claim({name: study(Problem.of_scene(load_scene(name)), t_end) for name, t_end in SCENES.items()}, figures)
     ]
 
 
-def cost_claim(found: Found, figures: Path) -> Claim:
-    """Judge costs by scene of `SCENES`."""
+def cost_claim(by_scene: Costs, figures: Path) -> Claim:
+    """Return the verdict on costs by scene of `SCENES`."""
     literal = all(
         (cost.count("newton") > 0) == (cost.formulation == "reduced")
-        for costs in found.values()
+        for costs in by_scene.values()
         for cost in costs
         if cost.formulation != "DAE" and not cost.reason
     )
     saved = all(
         cheapest(costs, "eq. 8", epsilon).seconds < CHEAPER * cheapest(costs, "reduced").seconds
-        for costs in found.values()
+        for costs in by_scene.values()
         for epsilon in PAPER
     )
     return Claim(
         key="cost",
         verdict=("holds" if saved else "holds with a condition") if literal else "does not hold",
-        figures=(_draw(found, figures),),
-        table=_table(found),
-        **_text(found),
+        figures=(_draw(by_scene, figures),),
+        table=_table(by_scene),
+        **_text(by_scene),
     )
 
 
-def _text(found: Found) -> dict[str, Any]:
-    """Say what sigma adds to a right-hand side and epsilon to their number, from the first scene's explicit runs."""
-    scene = next(iter(found))
-    explicit = [c for c in found[scene] if c.method == METHODS[0]]
+def _text(by_scene: Costs) -> dict[str, Any]:
+    """Return the texts on the cost of sigma and the growth with epsilon, by explicit runs of the first scene."""
+    scene = next(iter(by_scene))
+    explicit = [c for c in by_scene[scene] if c.method == METHODS[0]]
     reduced, printed = (next(c for c in explicit if c.formulation == name) for name in ("reduced", "eq. 8"))
     with_sigma, without = (1e6 * c.seconds / c.count("rhs") for c in (reduced, printed))
     stiffest = min((c for c in explicit if c.epsilon and not c.reason), key=lambda c: c.epsilon or 0.0)
@@ -68,22 +68,22 @@ def _text(found: Found) -> dict[str, Any]:
         step=SCENES[scene] / stiffest.count("steps") / (stiffest.epsilon or 1.0),
         epsilon=stiffest.epsilon,
         target=Search().target,
-        cheapest={name: [cheapest(costs, *which) for which in asked] for name, costs in found.items()},
+        cheapest={name: [cheapest(costs, *which) for which in asked] for name, costs in by_scene.items()},
         stopped=[
             (name, cost)
-            for name, costs in found.items()
+            for name, costs in by_scene.items()
             for cost in costs
             if cost.reason and cost.outcome and cost.epsilon is not None
         ],
     )
 
 
-def _table(found: Found) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+def _table(by_scene: Costs) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
     order = ("reduced", "DAE", "eq. 8")
     heads = ("scene", "model", "ε", "method", "rtol", "error", "rhs", "σ", "iter.", "Jac.", "LU", "ms")
     rows = [
         (name.split("/")[-1], *_row(cost))
-        for name, costs in found.items()
+        for name, costs in by_scene.items()
         for cost in sorted(costs, key=lambda cost: (order.index(cost.formulation), -(cost.epsilon or 0)))
     ]
     return heads, tuple(rows)
@@ -102,9 +102,9 @@ def _row(cost: Cost) -> tuple[str, ...]:
     return (*head, f"{cost.rtol:.0e}", f"{cost.error:.0e}", *measured)
 
 
-def _draw(found: Found, figures: Path) -> str:
-    figure, axes = chart(len(found))
-    for ax, (name, costs) in zip(axes, found.items(), strict=True):
+def _draw(by_scene: Costs, figures: Path) -> str:
+    figure, axes = chart(len(by_scene))
+    for ax, (name, costs) in zip(axes, by_scene.items(), strict=True):
         ax.set(xscale="log", xlim=(min(EPSILONS) / 2, max(EPSILONS) * 2), xlabel="ε (s)")
         ax.set(yscale="log", ylim=(200, 4e5), ylabel="right-hand sides")
         for method, colour in zip(METHODS, COLOURS, strict=False):

@@ -1,6 +1,6 @@
-"""Through a singular configuration: the uncontrolled mechanism carried across by its own motion, as a DAE.
+"""Run the uncontrolled mechanism through a singular configuration, as a DAE.
 
-If freedoms were lost where phi_z is singular, a motion through such a configuration could not exist.
+If freedoms were lost where phi_z is singular, no motion could pass through such a configuration.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from scripts.experiments.paper.experiment import between, march
 
 __all__ = ["Crossing", "cross"]
 
-SAMPLES = 8  # a step
+SAMPLES = 8  # per step
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """A free motion that is at a singular configuration in its middle.
+    """A free motion with a singular configuration at its middle.
 
     Attributes
     ----------
     t : (m,) array
         Seconds, zero at the singular configuration.
     det_phi_z : (m,) array
-        Zero there and only there; on its two sides are different assembly branches, or the same.
+        Zero only at t = 0. Before and after are two assembly branches, or the same one.
     sigma_min_J : (m,) array
-        The singular value that decides on J's rank.
+        The smallest singular value of J, which decides its rank.
     returned : float
-        How far the motion, started a while before, misses the singular configuration at t = 0, rad or m.
+        Distance of the integrated motion from the singular configuration at t = 0, rad or m.
     energy_drift : float
         Largest |energy - energy at the start|, J.
     """
@@ -55,11 +55,11 @@ class Crossing:
 
 
 def cross(mechanism: Mechanism, point: SingularPoint, speed: float = 3.0, half: float = 0.05) -> Crossing:
-    """Let a mechanism with square phi_z fall through a singular configuration.
+    """Integrate a free motion of a mechanism with square phi_z through a singular configuration.
 
-    The motion is fixed by its velocity at the singular configuration: half along the null vector of phi_z, half
-    along the allowed velocities perpendicular to it, so that q moves too. It is found a while before by running
-    it backwards, and from there it is integrated through.
+    The velocity at the singular configuration has equal parts along the null vector of phi_z and along an admissible
+    velocity perpendicular to it, so that q moves too. The motion is first integrated backwards from there; from the
+    resulting start it is then integrated through the singular configuration.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def cross(mechanism: Mechanism, point: SingularPoint, speed: float = 3.0, half: 
     Raises
     ------
     NumericalError
-        The DAE cannot be integrated through, as where J loses rank.
+        The DAE cannot be integrated through, for example because J loses rank.
     """
     allowed = np.linalg.svd(point.at.J)[2][mechanism.rank :]
     across = allowed - np.outer(allowed @ point.null, point.null)
@@ -93,14 +93,14 @@ def cross(mechanism: Mechanism, point: SingularPoint, speed: float = 3.0, half: 
 
 
 def _fall(mechanism: Mechanism, at: Kinematics, v: Array, duration: float) -> list[tuple[float, Terms]]:
-    """Integrate the free DAE; states at and between its steps, the middle of the time among them."""
+    """Integrate the free DAE; return states at and between its steps and at the middle of the interval."""
     none = np.zeros(mechanism.n)
     dae = Dae(mechanism, at, v, lambda t, terms: none, (0.0, duration))
     way = [(0.0, dae.terms(0.0, dae.y0))]
 
     def note(solver: Any) -> None:
-        wanted = np.union1d(np.linspace(solver.t_old, solver.t, SAMPLES + 1), [duration / 2])
-        way.extend((t, dae.terms(t, y)) for t, y in between(solver, wanted))
+        times = np.union1d(np.linspace(solver.t_old, solver.t, SAMPLES + 1), [duration / 2])
+        way.extend((t, dae.terms(t, y)) for t, y in between(solver, times))
 
     outcome = march(dae, "DOP853", 1e-11, duration, on_step=note)
     if outcome.stopped:

@@ -1,9 +1,11 @@
-"""Section III-C: "the more exact reduced model periodically sees some deviations": what makes a tracking run deviate.
+"""Section III-C, "the more exact reduced model periodically sees some deviations": sources of tracking deviations.
 
-With w(0) = 0 the SPF and the reduced model are the same system, and its error q - q_d falls with e^-t. So a
-deviation is numerical. Three ways to one are measured: a loose tolerance of the integrator; a sigma that is solved
-loosely, the same z in plant and controller; and a controller that solves sigma loosely by itself, from its last
-solution, while the plant has its own z.
+With w(0) = 0 the SPF and the reduced model are the same system, and its error q - q_d decays with e^-t. So any
+deviation is numerical. Three sources are measured:
+
+- a loose tolerance of the integrator;
+- a sigma that is solved loosely, with the same z in plant and controller;
+- a controller that solves its own sigma loosely, from its last solution, while the plant's z is accurate.
 """
 
 from __future__ import annotations
@@ -25,20 +27,20 @@ from scripts.experiments.paper.experiment import Problem, between, march
 
 __all__ = ["PERIOD", "Deviation", "FromLast", "OwnSigma", "Setting", "Track", "deviation", "instants", "track"]
 
-PERIOD = 2 * np.pi  # s, of eq. 21
-SAMPLES = 128  # in a period
-SETTLED = 1  # period after which the start is forgotten
+PERIOD = 2 * np.pi  # s, period of eq. 21
+SAMPLES = 128  # per period
+SETTLED = 1  # number of periods after which the start has no influence
 
 
 class FromLast:
-    """sigma solved from its solution at the last accepted step, and only to a tolerance.
+    """Solve sigma from its solution at the last accepted step, to a given tolerance.
 
     Parameters
     ----------
     mechanism : Mechanism
     start : Kinematics
     tolerance : float
-        Largest |phi| that is taken for closed, m.
+        Largest |phi| that counts as closed, m.
     """
 
     def __init__(self, mechanism: Mechanism, start: Kinematics, tolerance: float) -> None:
@@ -50,14 +52,14 @@ class FromLast:
         step[self._last.partition.q] = q - self._mechanism.independent_part(self._last.q_tree)
         return newton(self._last.integrate(step), 0.0, self._tolerance).at
 
-    def keep(self, q: Array) -> Kinematics:
-        """Return the configuration at the q of an accepted step: where the next ones start."""
+    def accept_step(self, q: Array) -> Kinematics:
+        """Return the configuration at the q of an accepted step and make it the next initial guess."""
         self._last = self.at(q)
         return self._last
 
 
 class OwnSigma:
-    """The force of a controller whose z is its own, not the plant's."""
+    """Force of a controller that solves z by its own sigma."""
 
     def __init__(self, force: Force, sigma: FromLast) -> None:
         self.force, self.sigma = force, sigma
@@ -70,7 +72,7 @@ class OwnSigma:
 
 @dataclass
 class Loose(LevelSet):
-    """The reduced model whose z, the controller's as well, is solved `FromLast`."""
+    """The reduced model with z solved by `FromLast`, in plant and controller."""
 
     sigma: FromLast = field(kw_only=True)
 
@@ -80,7 +82,7 @@ class Loose(LevelSet):
 
 @dataclass(frozen=True)
 class Setting:
-    """How a tracking run is integrated, and how sigma is solved.
+    """Integrator and solution of sigma in a tracking run.
 
     Attributes
     ----------
@@ -89,28 +91,28 @@ class Setting:
         A class of `scipy.integrate`.
     rtol : float
     tolerance : float or None
-        Largest |phi| that the reduced model's sigma takes for closed, solved `FromLast`, m.
-    own : float or None
-        The same of a sigma that the controller solves by itself.
+        Tolerance of `FromLast` for the reduced model's sigma, m.
+    controller_tolerance : float or None
+        Tolerance of `FromLast` for the controller's own sigma, m.
     """
 
     model: Literal["reduced", "eq. 8"]
     method: str
     rtol: float
     tolerance: float | None = None
-    own: float | None = None
+    controller_tolerance: float | None = None
 
 
 @dataclass(frozen=True)
 class Track:
-    """A run at given times.
+    """A run, sampled at given times.
 
     Attributes
     ----------
     q : (m, d) array
         rad or m.
     open : float
-        Largest |phi| there of the z that the plant has, and the controller where it has its own, m.
+        Largest |phi| of the plant's z and of the controller's own z, m.
     """
 
     q: Array
@@ -118,19 +120,19 @@ class Track:
 
 
 def track(scene: str, setting: Setting, times: Array) -> Track:
-    """Run a scene with a controller and return its q at increasing times, from 0 on.
+    """Run a scene with a controller and return its q at increasing times from 0.
 
     Raises
     ------
     NumericalError
-        The run does not get to the last one.
+        The run stops before the last time.
     """
     loaded = load_scene(scene)
     if loaded.spec.controller is None:
         raise InputError(f"{loaded.name}: a scene with a controller is needed")
     problem, sigma = Problem.of_scene(loaded), None
-    if setting.own is not None:
-        sigma = FromLast(problem.mechanism, problem.at, setting.own)
+    if setting.controller_tolerance is not None:
+        sigma = FromLast(problem.mechanism, problem.at, setting.controller_tolerance)
         problem = replace(problem, force=OwnSigma(problem.force, sigma))
     ivp: Ivp = problem.reduced() if setting.model == "reduced" else problem.printed_spf(loaded.spec.epsilon)
     if setting.tolerance is not None:
@@ -145,7 +147,7 @@ def track(scene: str, setting: Setting, times: Array) -> Track:
             q.append(at.q)
             opened.append(at.phi)
         if sigma is not None:
-            opened.append(sigma.keep(ivp.terms(solver.t, solver.y).q).phi)
+            opened.append(sigma.accept_step(ivp.terms(solver.t, solver.y).q).phi)
 
     outcome = march(ivp, setting.method, setting.rtol, float(times[-1]), on_step=note)
     if outcome.stopped:
@@ -155,19 +157,19 @@ def track(scene: str, setting: Setting, times: Array) -> Track:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far a run is from the exact one, and whether that repeats with the desired trajectory's period.
+    """Difference of a run from the exact one, and whether it repeats with the desired trajectory's period.
 
     Attributes
     ----------
     size : (m,) array
-        Largest |q - q_exact| of the coordinates, rad or m, at instants SAMPLES to a period.
+        Largest |q - q_exact| of the coordinates, rad or m, at SAMPLES instants per period.
     largest : float
-        Of size, after the first period.
+        Largest size after the first period.
     repeats : float
-        The share of its variance over time that every period shows alike: near 1 for a periodic deviation, about
+        Share of the variance over time that is common to all periods: near 1 for a periodic deviation, about
         1 / (number of periods) for an irregular one.
     period : float
-        The strongest period in it, s.
+        Period of the strongest Fourier component, s.
     open : float
         Largest |phi|, m.
     """
@@ -196,5 +198,5 @@ def deviation(run: Track, exact: Track) -> Deviation:
 
 
 def instants(periods: int) -> Array:
-    """Return whole periods from 0, SAMPLES instants to each and the last one's end, s; at least two."""
+    """Return the instants of at least two whole periods from 0, SAMPLES per period and the last end, s."""
     return np.linspace(0.0, periods * PERIOD, periods * SAMPLES + 1)

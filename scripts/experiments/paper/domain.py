@@ -1,4 +1,4 @@
-"""Where the reduced model and the SPF are defined: the implicit function theorem, and the domain of eq. 8."""
+"""Domains of the reduced model and the SPF: the implicit function theorem, and the domain of eq. 8."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ __all__ = ["Beyond", "PsiCheck", "check_psi", "claims", "off_manifold"]
 STATES = 1000
 STARTS = 20
 EPSILON = 1e-3
-LAYERS = 20.0  # boundary layers, t / epsilon, that the SPF is given to reach phi = 0
+LAYERS = 20.0  # t / epsilon at the end of runs of the SPF towards phi = 0
 
 
 @dataclass(frozen=True)
 class PsiCheck:
-    """Psi_{q'} of eq. 3 against phi_z, at random configurations and at singular ones.
+    """Comparison of Psi_{q'} of eq. 3 with phi_z, at random and at singular configurations.
 
     Attributes
     ----------
@@ -37,12 +37,12 @@ class PsiCheck:
     determinant : float
         Largest | |det Psi_{q'}| - |det phi_z| |, relative to the largest |det phi_z|.
     rho : float
-        Largest difference of rho by eq. 5, -Psi_{q'}^-1 Psi_q, from what the program computes with phi_z,
-        relative to the largest entry there.
+        Largest difference of rho by eq. 5, -Psi_{q'}^-1 Psi_q, from rho computed with phi_z,
+        relative to its largest entry.
     singular : float
-        Largest |det Psi_{q'}| at configurations that were solved for as singular ones.
+        Largest |det Psi_{q'}| at singular configurations.
     norm : float
-        Least |Psi_{q'}| there: the matrix itself is never zero.
+        Smallest |Psi_{q'}| at singular configurations: the matrix itself is never zero.
     """
 
     states: int
@@ -54,18 +54,18 @@ class PsiCheck:
 
 @dataclass(frozen=True)
 class Beyond:
-    """Eq. 8 started off the manifold, from random (q, z) with phi_z regular.
+    """Runs of eq. 8 from random (q, z) off the manifold, with regular phi_z.
 
     Attributes
     ----------
     reachable : bool
         Whether phi(q, z) = 0 has a solution z at the q of these starts.
     sigma_min : (m,) array
-        Of phi_z at the starts.
+        Smallest singular value of phi_z at the starts.
     layers : (m,) array
         t / epsilon at the end.
     arrived : (m,) array of bool
-        Whether phi had decayed like exp(-t / epsilon) all the way when the time was over.
+        Whether phi decayed like exp(-t / epsilon) to the end.
     """
 
     reachable: bool
@@ -75,23 +75,23 @@ class Beyond:
 
 
 def check_psi(mechanism: Mechanism, states: int = STATES, seed: int = 0) -> PsiCheck:
-    """Compare Psi_{q'} with phi_z at random configurations, on the closure or (nearly all of them) off it.
+    """Compare Psi_{q'} with phi_z at random configurations, nearly all of them off the constraint manifold.
 
     Parameters
     ----------
     mechanism : Mechanism
-        With square phi_z and joints of one freedom.
+        Mechanism with square phi_z and joints of one freedom.
     """
     random = np.random.default_rng(seed)
     steps = random.uniform(-np.pi, np.pi, (states, mechanism.n))
-    every = [mechanism.kinematics(mechanism.tree.integrate(mechanism.q_tree, step)) for step in steps]
-    psi = np.array([np.linalg.det(Psi(at).jacobian) for at in every])
-    phi_z = np.array([np.linalg.det(at.phi_z) for at in every])
+    configurations = [mechanism.kinematics(mechanism.tree.integrate(mechanism.q_tree, step)) for step in steps]
+    psi = np.array([np.linalg.det(Psi(at).jacobian) for at in configurations])
+    phi_z = np.array([np.linalg.det(at.phi_z) for at in configurations])
     singular = [Psi(point.at).jacobian for point in search_singular(mechanism, STARTS)]
     return PsiCheck(
         states=states,
         determinant=float(np.abs(np.abs(psi) - np.abs(phi_z)).max() / np.abs(phi_z).max()),
-        rho=max(_rho_difference(at) for at in every),
+        rho=max(_rho_difference(at) for at in configurations),
         singular=max(abs(float(np.linalg.det(jacobian))) for jacobian in singular),
         norm=min(float(np.linalg.norm(jacobian)) for jacobian in singular),
     )
@@ -104,7 +104,7 @@ def _rho_difference(at: Kinematics) -> float:
 
 
 def off_manifold(mechanism: Mechanism, *, reachable: bool, count: int = STARTS, seed: int = 0) -> Beyond:
-    """Start eq. 8 as printed, without control and from rest, at random (q, z) off the manifold."""
+    """Run eq. 8 as printed from rest without control, from random (q, z) off the manifold."""
     random = np.random.default_rng(seed)
     none = np.zeros(mechanism.n)
     rows: list[tuple[float, float, bool]] = []

@@ -17,5 +17,5 @@ ERRATA: dict[str, Callable[[], Erratum]] = {
 
 
 def find(keys: Iterable[str]) -> list[Erratum]:
-    """Compute errata by key, all of them when none is given."""
+    """Compute errata by key, all of them without keys."""
     return [ERRATA[key]() for key in (list(keys) or ERRATA)]

@@ -1,4 +1,4 @@
-"""Errata of the controllers and their proofs: eqs. 14 to 19, each at a state of the five-bar that shows it."""
+"""Errata of the controllers and their proofs, eqs. 14 to 19, each shown at a state of the five-bar."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["CONTROL"]
 
 Q_DOT = np.array([1.0, -2.0])  # rad/s
 STEP = 1e-6  # s, of central differences
-WEAK = 0.3  # N m/rad, a K_P too weak for eq. 15 to have one solution only
-T = 1.0  # s, into the tracking run: the error is e^-1 of the initial one
+WEAK = 0.3  # N m/rad: a K_P so small that eq. 15 has several solutions
+T = 1.0  # s: time in the tracking run, at which the error is e^-1 of the initial one
 ON_MANIFOLD = np.zeros(2)  # w, m
 
 
 def set_point_error() -> Erratum:
-    """Section II-B: which sign the error has."""
+    """Section II-B: the sign of the error."""
     reduced, controller = _set_point()
     state = np.concatenate([reduced.y0[: reduced.mechanism.d] + 0.3, Q_DOT])
     q_d, h_d = controller.q_d, controller.target.h
@@ -94,11 +94,11 @@ def equilibrium_sign() -> Erratum:
 def gain_condition() -> Erratum:
     """Eq. 18 needs a condition on Lambda^T K_D."""
     Lambda, K_D = np.array([[1.0, 4.0], [0.0, 1.0]]), np.eye(2)
-    least = float(np.linalg.eigvalsh((Lambda.T @ K_D + K_D @ Lambda) / 2)[0])
+    smallest = float(np.linalg.eigvalsh((Lambda.T @ K_D + K_D @ Lambda) / 2)[0])
     diagonal = float(np.linalg.eigvalsh(np.eye(2).T @ (10 * np.eye(2)))[0])
     return Erratum(
         key="gain-condition",
-        difference=-least,
+        difference=-smallest,
         agreement=max(0.0, -diagonal),
         unit="N m/rad",
         **said("errata/gain-condition", Lambda=Lambda.tolist()),
@@ -131,8 +131,8 @@ def rate_on_trajectory() -> Erratum:
     """Eq. 19's last line, as printed, is negative where V is zero."""
     problem, controller = _tracking()
     q_d, q_d_dot, _ = controller.desired(T)
-    found = sigma(problem.mechanism, q_d)
-    reduced = replace(problem, at=found.at, q_dot=q_d_dot).reduced()
+    closed = sigma(problem.mechanism, q_d)
+    reduced = replace(problem, at=closed.at, q_dot=q_d_dot).reduced()
     measured = _rate(reduced, T, np.concatenate([q_d, q_d_dot]), _reported(reduced, controller))
     return Erratum(
         key="rate-on-trajectory",
@@ -168,7 +168,7 @@ def _scene(name: str) -> tuple[Problem, object]:
 
 
 def _reported(reduced: LevelSet, controller: Tracking) -> Callable[[float, Array], float]:
-    """Return the function that the program reports, of (t, y)."""
+    """Return the reported Lyapunov function as a function of (t, y)."""
     return lambda t, y: controller.lyapunov(t, reduced.terms(t, y), ON_MANIFOLD)
 
 

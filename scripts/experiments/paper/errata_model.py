@@ -28,7 +28,7 @@ FALL = 0.1  # s
 
 
 def multipliers() -> Erratum:
-    """Eq. 1 without J^T lambda: the chains fall apart."""
+    """Eq. 1 lacks J^T lambda, so that the loop opens."""
     from scipy.integrate import solve_ivp
 
     problem = Problem.of_scene(load_scene(f"{FIVE_BAR}/swing"))
@@ -51,7 +51,7 @@ def multipliers() -> Erratum:
 
 
 def psi_determinant() -> Erratum:
-    """Psi_{q'} = 0 for det Psi_{q'} = 0."""
+    """The condition Psi_{q'} = 0 should read det Psi_{q'} = 0."""
     check = check_psi(load(FIVE_BAR), states=1)
     return Erratum(
         key="psi-determinant",
@@ -63,7 +63,7 @@ def psi_determinant() -> Erratum:
 
 
 def coriolis_power() -> Erratum:
-    """Eq. 25: squares in c12 and c34."""
+    """Eq. 25 squares the rates in c12 and c34."""
     printed, first = (
         max(_relative(LOOP.C_tree(q, v, power) @ v, terms.C_tree @ v) for q, v, terms in _states()) for power in (2, 1)
     )
@@ -77,7 +77,7 @@ def coriolis_power() -> Erratum:
 
 
 def coriolis_skew() -> Erratum:
-    """Eq. 25, even with first powers, is not the Christoffel matrix."""
+    """Eq. 25 is not the Christoffel matrix, even with first powers."""
     printed = max(_skew(terms, LOOP.C_tree(q, v, 1)) for q, v, terms in _states())
     christoffel = max(_skew(terms, terms.C_tree) for _, _, terms in _states())
     return Erratum(
@@ -90,7 +90,7 @@ def coriolis_skew() -> Erratum:
 
 
 def closure_angles() -> Erratum:
-    """Eq. 27: the sum of angles belongs to the distal link."""
+    """Eq. 27 assigns the sum of angles to the wrong link; it belongs to the distal one."""
     at = stable_equilibrium(load(FIVE_BAR))
     return Erratum(
         key="closure-angles",
@@ -103,7 +103,7 @@ def closure_angles() -> Erratum:
 
 
 def table_rows() -> Erratum:
-    """Table I, rows 3 and 4."""
+    """Rows 3 and 4 of Table I are exchanged."""
     (_, printed, reach), (_, loop, loop_reach) = (widest(*tracking(name)) for name in (PRINTED, FIVE_BAR))
     return Erratum(
         key="table-rows",
@@ -116,21 +116,21 @@ def table_rows() -> Erratum:
 
 
 def type_1_points() -> Erratum:
-    """Type 1 is two points."""
+    """Singularities of type 1 are two points."""
     mechanism = load(FIVE_BAR)
     q = np.array([wrap(p.at.q_tree[[0, 2]]) for p in search_singular(mechanism, 20) if p.kind == "locked"])
     upper, lower = q[q[:, 0] > 0], q[q[:, 0] < 0]
     return Erratum(
         key="type-1-points",
         difference=float(np.linalg.norm(upper[0] - lower[0])),
-        agreement=max(float(np.abs(found - found[0]).max()) for found in (upper, lower, np.vstack([upper, -lower]))),
+        agreement=max(float(np.abs(points - points[0]).max()) for points in (upper, lower, np.vstack([upper, -lower]))),
         unit="rad",
         **said("errata/type-1-points", q=upper[0], solutions=len(q)),
     )
 
 
 def lost_freedoms() -> Erratum:
-    """No freedom is lost."""
+    """No freedom is lost at singularities of types 1 and 2."""
     mechanism = load(FIVE_BAR)
     points = search_singular(mechanism, 20)
     return Erratum(
@@ -162,7 +162,7 @@ def _relative(a: Array, b: Array) -> float:
 def _skew(terms: Terms, C_tree: Array) -> float:
     mechanism: Mechanism = terms.mechanism
     step = 1e-5
-    ahead, behind = (
+    forward, backward = (
         Terms(mechanism, terms.at.integrate(sign * step * terms.v_tree), terms.v_tree).D_tree for sign in (1.0, -1.0)
     )
-    return float(np.abs((ahead - behind) / (2 * step) - C_tree - C_tree.T).max())
+    return float(np.abs((forward - backward) / (2 * step) - C_tree - C_tree.T).max())

@@ -1,4 +1,4 @@
-"""Errata of the singular perturbation formulation: eqs. 11, 13 and 16's arguments, off the manifold."""
+"""Errata of the singular perturbation formulation off the manifold: eqs. 11, 13 and the arguments in eq. 16."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEP = 1e-5  # of central differences
 
 
 def fast_error() -> Erratum:
-    """Eq. 11: y is z minus h, and its slow terms carry epsilon."""
+    """Eq. 11: y is z - h, and its slow terms have a factor epsilon."""
     mechanism, on, at = _off_manifold()
     z = mechanism.partition.z
     z_dot = at.rho[z] @ Q_DOT - at.phi_z_factor.solve(W) / EPSILON
@@ -49,12 +49,12 @@ def fast_error() -> Erratum:
 
 
 def boundary_layer_sign() -> Erratum:
-    """Eq. 13: the sign, and c."""
+    """Eq. 13: the sign, and the constant c."""
     mechanism, on, _ = _off_manifold()
     z, columns = mechanism.partition.z, []
     for step in STEP * np.eye(mechanism.n)[z]:
-        ahead, behind = (on.integrate(sign * step) for sign in (1.0, -1.0))
-        columns.append((ahead.phi_z_factor.solve(ahead.phi) - behind.phi_z_factor.solve(behind.phi)) / (2 * STEP))
+        plus, minus = (on.integrate(sign * step) for sign in (1.0, -1.0))
+        columns.append((plus.phi_z_factor.solve(plus.phi) - minus.phi_z_factor.solve(minus.phi)) / (2 * STEP))
     printed = np.linalg.eigvals(np.array(columns).T).real
     return Erratum(
         key="boundary-layer-sign",
@@ -69,7 +69,7 @@ def coriolis_arguments() -> Erratum:
     """Eq. 8's C(q, z, q_dot) is not eq. 16's C(q, q_dot, z, z_dot)."""
     mechanism, on, at = _off_manifold()
 
-    def apart(where: Kinematics, w: Array) -> float:
+    def relative_error(where: Kinematics, w: Array) -> float:
         def C(velocity: CoriolisVelocity) -> Array:
             return spf_terms(mechanism, where, Q_DOT, EPSILON, w, velocity).C
 
@@ -77,8 +77,8 @@ def coriolis_arguments() -> Erratum:
 
     return Erratum(
         key="coriolis-arguments",
-        difference=apart(at, W),
-        agreement=apart(on, np.zeros(2)),
+        difference=relative_error(at, W),
+        agreement=relative_error(on, np.zeros(2)),
         unit="kg m²/s",
         commands=("./scripts/experiment paper tikhonov-velocity",),
         **said("errata/coriolis-arguments", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
@@ -88,11 +88,11 @@ def coriolis_arguments() -> Erratum:
 def gravity_arguments() -> Erratum:
     """Eq. 16's h(q) does not give eq. 17."""
     mechanism, on, at = _off_manifold()
-    h_of_q, h, own = (Terms(mechanism, where, np.zeros(4)).h for where in (on, at, at))
+    h_of_q, h, exact = (Terms(mechanism, where, np.zeros(4)).h for where in (on, at, at))
     return Erratum(
         key="gravity-arguments",
-        difference=float(np.abs(h_of_q - own).max()),
-        agreement=float(np.abs(h - own).max()),
+        difference=float(np.abs(h_of_q - exact).max()),
+        agreement=float(np.abs(h - exact).max()),
         unit="N m",
         **said("errata/gravity-arguments", w=W.tolist()),
     )
@@ -102,6 +102,6 @@ SPF = (fast_error, boundary_layer_sign, coriolis_arguments, gravity_arguments)
 
 
 def _off_manifold() -> tuple[Mechanism, Kinematics, Kinematics]:
-    """Return the five-bar on phi = 0, half a radian off its equilibrium, and with the same q on phi = W."""
+    """Return the five-bar, a configuration half a radian off its equilibrium, and one with the same q on phi = W."""
     problem = Problem.of_scene(load_scene(f"{FIVE_BAR}/swing"))
     return problem.mechanism, problem.at, on_level(problem.mechanism, problem.at, W)

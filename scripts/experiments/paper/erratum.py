@@ -1,4 +1,4 @@
-"""An erratum of the paper, with the number that shows it."""
+"""An erratum of the paper with the number that shows it."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ __all__ = ["Erratum"]
 
 @dataclass(frozen=True)
 class Erratum:
-    """A place where the paper is not as it should be; its texts are in ``templates/errata``.
+    """An error in the paper; its texts are in ``templates/errata``.
 
     Attributes
     ----------
     key : str
-        What the command line calls it.
+        Name on the command line.
     where : str
     printed, correct : str
-        The two forms.
+        The printed and the correct form.
     difference : float
-        How far the printed form is from what is true, as measured.
+        Measured error of the printed form.
     agreement : float
-        The same of the correct form: rounding or truncation errors.
+        Measured error of the correct form: rounding or truncation.
     unit : str
-        Of both.
+        Unit of both errors.
     measured : str
-        What was compared with what.
+        Description of the comparison.
     commands : tuple of str
-        What else a reader can run to see it; ``./scripts/experiment errata KEY`` always shows it.
+        Further commands that show it, besides ``./scripts/experiment errata KEY``.
     """
 
     key: str

@@ -1,6 +1,6 @@
-"""One motion in every formulation, marched to its end by SciPy: what the studies of epsilon and of cost share.
+"""Integrate one motion in every formulation by SciPy, for the studies of epsilon and of cost.
 
-Nothing is recorded on the way, so that a march's time and counts are those of the integration alone.
+Nothing is recorded on the way, so that times and counts are those of the integration only.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ __all__ = [
 W0 = np.array([0.01, -0.006])  # w(0) of the studies on the five-bar, m
 MOVING = np.array([1.0, -2.0])  # q_dot(0) of their moving start, rad/s
 OFFSET = 0.5  # of theta_1 and theta_3 from the equilibrium, rad
-OPEN = (0.0, np.inf)  # s: a march says where it ends
+OPEN = (0.0, np.inf)  # s: the time span of a `march` is set by its t_end
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What to move, from where, under which force.
+    """Mechanism, start and force of a motion.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Problem:
         The start, on phi = 0.
     q_dot : (d,) array
     force : callable
-        (t, terms) to u' on the tree.
+        Function of (t, terms) that returns u' on the tree.
     """
 
     mechanism: Mechanism
@@ -68,39 +68,39 @@ class Problem:
 
     @classmethod
     def free(cls, mechanism: Mechanism, at: Kinematics, q_dot: Array) -> Problem:
-        """No actuator does anything."""
+        """Return a problem without actuation."""
         none = np.zeros(mechanism.n)
         return cls(mechanism, at, q_dot, lambda t, terms: none)
 
     @classmethod
     def of_scene(cls, scene: Scene) -> Problem:
-        """Take a scene's start and controller; its formulation, solver and w are left aside."""
+        """Return a problem with a scene's start and controller; formulation, solver and w of the scene are ignored."""
         mechanism = load_scene_mechanism(scene)
         start = find_start(mechanism, scene)
         force = make_force(build_scene_controller(scene, mechanism), build_scene_actuation(scene, mechanism))
         return cls(mechanism, start.at, start.q_dot, force)
 
     def dae(self) -> Dae:
-        """Eq. 1, its closure differentiated twice and never projected."""
+        """Return eq. 1 with phi_ddot = 0 and without projection."""
         return Dae(self.mechanism, self.at, self.at.rho @ self.q_dot, self.force, OPEN)
 
     def reduced(self) -> LevelSet:
-        """Eq. 6."""
+        """Return eq. 6."""
         return LevelSet(self.mechanism, self.at, self.q_dot, self.force, OPEN)
 
     def spf(self, epsilon: float, w: Array, convention: CoriolisVelocity = "rho") -> LevelSet:
-        """Eq. 17, from the same q and q_dot with z on phi = w."""
+        """Return eq. 17 from the same q and q_dot, with z on phi = w."""
         start = on_level(self.mechanism, self.at, w)
         return LevelSet(self.mechanism, start, self.q_dot, self.force, OPEN, epsilon, w, convention)
 
     def printed_spf(self, epsilon: float) -> PrintedSpf:
-        """Eq. 8 as printed, from phi = 0."""
+        """Return eq. 8 as printed, from phi = 0."""
         w0 = np.zeros(self.mechanism.closure.rows)
         return PrintedSpf(self.mechanism, self.at, self.q_dot, self.force, OPEN, epsilon, w0)
 
 
 def five_bar_problem(moving: bool) -> Problem:
-    """Free motion of the five-bar, theta_1 and theta_3 half a radian past the equilibrium, from rest or moving."""
+    """Return a free motion of the five-bar from half a radian past the equilibrium, at rest or moving."""
     mechanism = load("five_bar")
     equilibrium = stable_equilibrium(mechanism)
     start = sigma(mechanism, mechanism.independent_part(equilibrium.q_tree) + OFFSET, equilibrium)
@@ -109,23 +109,23 @@ def five_bar_problem(moving: bool) -> Problem:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a march ended.
+    """Result of `march`.
 
     Attributes
     ----------
     t : float
         Time reached, s.
     terms : Terms
-        The state there.
+        Terms at that time.
     stats : dict of str to int
         rhs, steps, newton (corrections of sigma); jacobians and factorizations of an implicit integrator.
     iterations : int or None
-        Newton iterations of an implicit integrator, 0 for an explicit one; None where the solver does not
-        tell (LSODA). Radau's are right to a third of its rejected steps.
+        Newton iterations of an implicit integrator, 0 for an explicit one, None for LSODA, which does not count
+        them. For Radau the error is at most a third of the number of rejected steps.
     seconds : float
-        Processor time, s: on a busy machine it says more than the clock on the wall.
+        Processor time, s.
     stopped : str
-        Why the march ended early; empty when it did not.
+        Why the integration ended early; empty otherwise.
     """
 
     t: float
@@ -142,12 +142,12 @@ def on_level(mechanism: Mechanism, at: Kinematics, w: Array) -> Kinematics:
     Raises
     ------
     NumericalError
-        There is none on this branch.
+        This branch has none.
     """
-    found = sigma(mechanism, mechanism.independent_part(at.q_tree), at, w)
-    if found.verdict != "converged":
-        raise NumericalError(f"no z with phi = {np.asarray(w).tolist()} at this q: {found.reason}")
-    return found.at
+    solution = sigma(mechanism, mechanism.independent_part(at.q_tree), at, w)
+    if solution.verdict != "converged":
+        raise NumericalError(f"no z with phi = {np.asarray(w).tolist()} at this q: {solution.reason}")
+    return solution.at
 
 
 def march(
@@ -159,15 +159,15 @@ def march(
     max_rhs: int | None = None,
     on_step: Callable[[Any], None] | None = None,
 ) -> Outcome:
-    """Integrate to t_end, or to where the budget of right-hand sides or the numerics end it.
+    """Integrate to t_end, or until the budget of right-hand sides is exhausted or the numerics fail.
 
     Parameters
     ----------
     ivp : Ivp
     method : str
-        A class of `scipy.integrate`; Jacobians are by differences.
+        Name of a class of `scipy.integrate`; Jacobians are computed by differences.
     rtol : float
-        And atol = rtol / 100.
+        Relative tolerance; atol = rtol / 100.
     t_end : float
     max_rhs : int, optional
     on_step : callable, optional
@@ -207,10 +207,10 @@ def march(
 
 
 def _iterations(method: str, nfev: int, steps: int) -> int | None:
-    """Newton iterations of the integrator, from SciPy's nfev, which leaves finite-difference Jacobians out.
+    """Return the integrator's Newton iterations from SciPy's nfev, which excludes finite-difference Jacobians.
 
-    Two evaluations choose the first step. An iteration of BDF is one evaluation; one of Radau is three,
-    with one more at the end of each accepted step and where a rejected step's error is looked at again.
+    Two evaluations choose the first step. An iteration of BDF takes one evaluation. One of Radau takes three, plus one
+    at the end of each accepted step and one if the error of a rejected step is estimated again.
     """
     if method == "BDF":
         return nfev - 2
@@ -220,12 +220,12 @@ def _iterations(method: str, nfev: int, steps: int) -> int | None:
 
 
 def end_of(ivp: Ivp, method: str, rtol: float, t_end: float) -> Terms:
-    """Return the state that a motion reaches at t_end.
+    """Integrate a motion and return the terms at t_end.
 
     Raises
     ------
     NumericalError
-        It does not get there.
+        The motion stops before t_end.
     """
     outcome = march(ivp, method, rtol, t_end)
     if outcome.stopped:
@@ -234,35 +234,35 @@ def end_of(ivp: Ivp, method: str, rtol: float, t_end: float) -> Terms:
 
 
 def sample(ivp: Ivp, method: str, rtol: float, times: Array) -> list[Terms]:
-    """Return the states at increasing times, the first of them 0.
+    """Integrate a motion and return the terms at increasing times, the first of which is 0.
 
     Raises
     ------
     NumericalError
-        The motion does not get to the last one.
+        The motion stops before the last time.
     """
-    found = [ivp.terms(0.0, ivp.y0)]
+    states = [ivp.terms(0.0, ivp.y0)]
 
     def take(solver: Any) -> None:
-        found.extend(ivp.terms(t, y) for t, y in between(solver, times))
+        states.extend(ivp.terms(t, y) for t, y in between(solver, times))
 
     outcome = march(ivp, method, rtol, float(times[-1]), on_step=take)
     if outcome.stopped:
         raise NumericalError(outcome.stopped)
-    return found
+    return states
 
 
 def between(solver: Any, times: Array) -> list[tuple[float, Array]]:
-    """Return t and y at those of the times that lie in a SciPy solver's last step, its end included."""
+    """Return t and y at the times within a SciPy solver's last step, including its end."""
     inside = times[(times > solver.t_old) & (times <= solver.t)]
-    if not len(inside):  # an interpolant costs DOP853 three right-hand sides
+    if not len(inside):  # an interpolant of DOP853 takes three more right-hand sides
         return []
     at = solver.dense_output()
     return [(float(t), at(t)) for t in inside]
 
 
 def difference(a: Terms, b: Terms) -> tuple[float, float]:
-    """Largest difference of two states in x = (q, q_dot) and in z, rad or m and their rates."""
+    """Return the largest differences of two states in x = (q, q_dot) and in z, rad or m and their rates."""
     step = a.mechanism.tree.difference(a.q_tree, b.q_tree)
     part = a.at.partition
     x = np.concatenate([step[part.q], b.q_dot - a.q_dot])
@@ -270,5 +270,5 @@ def difference(a: Terms, b: Terms) -> tuple[float, float]:
 
 
 def vector(x: Array) -> str:
-    """Write a short vector for people: (0.01, -0.006)."""
+    """Format a short vector: (0.01, -0.006)."""
     return f"({', '.join(f'{v:.6g}' for v in x)})"

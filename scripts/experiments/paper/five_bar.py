@@ -1,4 +1,4 @@
-"""What only the paper's five-bar has: elbows, and what the paper says in terms of them."""
+"""Geometry of the paper's five-bar: link lengths, elbows and their distance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIVE_BAR, PRINTED = "five_bar", "five_bar_as_printed"
 
 @dataclass(frozen=True)
 class Links:
-    """Lengths in chain numbering (1, 2 left, 3, 4 right, proximal first) and the base link, metres."""
+    """Link lengths in chain numbering (1, 2 left, 3, 4 right, proximal first) and the base length, m."""
 
     l1: float
     l2: float
@@ -27,7 +27,7 @@ class Links:
 
 
 def links(mechanism: Mechanism) -> Links:
-    """Measure the links of a five-bar on its tree at angles zero, where all of them point along +x."""
+    """Return the link lengths of a five-bar, measured on its tree at angles zero, where all links point along +x."""
     pose = Pose(mechanism.tree, mechanism.closure.anchors, np.zeros(4))
     left, elbow_left, right, elbow_right = (
         pose.translation[mechanism.tree.model.getJointId(f"theta_{k}")][0] for k in (1, 2, 3, 4)
@@ -46,12 +46,12 @@ def links(mechanism: Mechanism) -> Links:
 
 
 def elbow_distance(l: Links, theta_1: Array | float, theta_3: Array | float) -> Array:
-    """Distance between the joints theta_2 and theta_4, metres; the loop closes from |l2 - l4| to l2 + l4."""
+    """Return the distance of the joints theta_2 and theta_4, m. The loop closes between |l2 - l4| and l2 + l4."""
     x = l.base + l.l3 * np.cos(theta_3) - l.l1 * np.cos(theta_1)
     y = l.l3 * np.sin(theta_3) - l.l1 * np.sin(theta_1)
     return np.asarray(np.hypot(x, y))
 
 
 def wrap(angle: Array) -> Array:
-    """Angles within [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""A Lyapunov function recorded along a run, differentiated and compared with what the paper says its rate is."""
+"""Compare the numerical derivative of a run's Lyapunov function with the rate that the paper gives."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from ckc_pin.run.run import Run
 
 __all__ = ["Record", "derivative", "record"]
 
-DEGREE = 7  # of the spline through the recorded values
-ROUNDING = 8  # spacings of floating-point numbers at the energies that the function is a difference of
+DEGREE = 7  # degree of the spline through the recorded values
+ROUNDING = 8  # rounding error in units of the floating-point spacing of the energies
 
 
 @dataclass(frozen=True)
 class Record:
-    """A Lyapunov function along a run.
+    """A Lyapunov function along a run, with its measured and predicted rates.
 
     Attributes
     ----------
     t, value : (m,) arrays
         s, J.
     rate : (m,) array
-        Derivative of the recorded values, by a spline of degree DEGREE: knows nothing of the equations. W.
+        Derivative of the recorded values by a spline of degree DEGREE, independent of the equations, W.
     predicted : (m,) array
         The paper's right-hand side at the recorded states, W.
     largest_increase : float
-        Of the value from one output instant to the next, J; negative when it always falls.
+        Largest increase from one output instant to the next, J; negative if the value always decreases.
     round_off : float
-        What rounding does to the value, and loops closed to the mechanism's tolerance, J.
+        Error bound of the value from rounding and from the tolerance of phi, J.
     """
 
     t: Array
@@ -43,12 +43,12 @@ class Record:
 
     @property
     def mismatch(self) -> float:
-        """Largest difference of rate and prediction, relative to the largest prediction."""
+        """Largest difference of measured and predicted rate, relative to the largest prediction."""
         return float(np.abs(self.rate - self.predicted).max() / np.abs(self.predicted).max())
 
     @property
     def monotone(self) -> bool:
-        """Whether no increase is larger than rounding."""
+        """Whether every increase is within the rounding error."""
         return self.largest_increase <= self.round_off
 
 
@@ -58,14 +58,14 @@ def record(run: Run, predicted: Callable[[int], float]) -> Record:
     Parameters
     ----------
     run : Run
-        Of a controller with a Lyapunov function, recorded densely.
+        Run of a controller with a Lyapunov function, with many output instants.
     predicted : callable
-        From a row of the run to the rate, W.
+        Returns the predicted rate in W for a row of the run.
     """
     if run.lyapunov is None:
         raise ValueError("the run's controller has no Lyapunov function")
     largest = max(float(np.abs(run.energy).max()), float(np.abs(run.lyapunov).max()))
-    # off the closure by phi the potential energy is off by lambda . phi, at both instants of a difference
+    # A residual phi changes the potential energy by lambda . phi, at both instants of a difference.
     forces = sum(np.abs(force).sum(axis=1) for force in run.loop_forces().values())
     unclosed = 2 * run.mechanism.tolerance * float(np.max(forces))
     return Record(
@@ -79,7 +79,7 @@ def record(run: Run, predicted: Callable[[int], float]) -> Record:
 
 
 def derivative(t: Array, value: Array) -> Array:
-    """Differentiate samples by an interpolating spline, shape (m,)."""
+    """Return the derivative of samples by an interpolating spline, shape (m,)."""
     from scipy.interpolate import make_interp_spline
 
     return np.asarray(make_interp_spline(t, value, k=DEGREE).derivative()(t))

@@ -1,4 +1,4 @@
-"""The paper, statement by statement: runs the studies, writes docs/paper.md with its figures, and docs/errata.md."""
+"""Run the studies of the paper and write docs/paper.md with its figures, and docs/errata.md."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ WORKERS = 2
 
 
 def collect(keys: Collection[str], figures: Path) -> list[Claim]:
-    """Run the studies that answer claims, several at a time; return these claims in the paper's order.
+    """Run the studies of the given claims in parallel; return these claims in the paper's order.
 
     Parameters
     ----------
     keys : collection of str
     figures : Path
-        Where the studies write their figures.
+        Folder for the figures.
 
     Raises
     ------
@@ -37,8 +37,8 @@ def collect(keys: Collection[str], figures: Path) -> list[Claim]:
     """
     chosen = [study for study, answers in STUDIES.items() if not set(answers).isdisjoint(keys)]
     with parallel_config("loky", n_jobs=min(WORKERS, len(chosen)), inner_max_num_threads=1):
-        found = Parallel(verbose=5 if len(chosen) > 1 else 0)(delayed(_answer)(study, figures) for study in chosen)
-    by_key = {claim.key: claim for claims in found for claim in claims}
+        results = Parallel(verbose=5 if len(chosen) > 1 else 0)(delayed(_answer)(study, figures) for study in chosen)
+    by_key = {claim.key: claim for claims in results for claim in claims}
     return [by_key[key] for key in KEYS if key in keys]
 
 
@@ -48,7 +48,7 @@ def _answer(study: str, figures: Path) -> list[Claim]:
 
 
 def as_frame(claims: Iterable[Claim]) -> pd.DataFrame:
-    """Return a row a claim, with the section it is in; its table is a frame of its own."""
+    """Return one row per claim with its section; a claim's table is a DataFrame in its cell."""
     section = {key: title for title, keys in SECTIONS.items() for key in keys}
     rows = [
         {
@@ -62,28 +62,28 @@ def as_frame(claims: Iterable[Claim]) -> pd.DataFrame:
 
 
 def page(claims: pd.DataFrame) -> str:
-    """Return docs/paper.md."""
+    """Return the text of docs/paper.md."""
     counts = {"holds": 0, "holds with a condition": 0, "does not hold": 0, **claims.verdict.value_counts()}
     return render("paper", claims=claims, counts=counts, versions=versions())
 
 
 def entries(claims: pd.DataFrame) -> str:
-    """Return claims as they are on the page."""
+    """Return claims in the format of docs/paper.md."""
     return render("entries", kind="paper", entries=claims)
 
 
 def errata_page(errata: Iterable[Erratum]) -> str:
-    """Return docs/errata.md."""
+    """Return the text of docs/errata.md."""
     return render("errata", errata=pd.DataFrame(map(asdict, errata)))
 
 
 def errata_entries(errata: Iterable[Erratum]) -> str:
-    """Return errata as they are on the page."""
+    """Return errata in the format of docs/errata.md."""
     return render("entries", kind="errata", entries=pd.DataFrame(map(asdict, errata)))
 
 
 def write(out: Path) -> list[Path]:
-    """Run everything and write both pages, their figures, and verdicts and errata as data; return the pages.
+    """Run all studies; write both pages, their figures, and verdicts and errata as CSV. Return the pages' paths.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The paper's appendix as it is printed, slips included: eqs. 24 to 27 and Table I. To compare with."""
+"""The paper's appendix as printed, errors included, for comparison: eqs. 24 to 27 and Table I."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ G = 9.81
 
 @dataclass(frozen=True)
 class Printed:
-    """The appendix with the rows of Table I that its links 1 to 4 take.
+    """The appendix with an assignment of Table I's rows to the links 1 to 4.
 
     Parameters
     ----------
     rows : tuple of int
-        (1, 2, 3, 4) as printed; (1, 2, 4, 3) numbers Table I around the loop.
+        (1, 2, 3, 4) as printed, or (1, 2, 4, 3) if Table I is numbered around the loop.
     """
 
     rows: tuple[int, int, int, int]
 
     def D_tree(self, q_tree: Array) -> Array:
-        """Eq. 24, (4, 4)."""
+        """Return D' of eq. 24, shape (4, 4)."""
         l, c, m, I = (self._column(k) for k in range(4))
         D = np.zeros((4, 4))
         for i, j in ((0, 1), (2, 3)):
@@ -45,7 +45,7 @@ class Printed:
         return D
 
     def C_tree(self, q_tree: Array, v_tree: Array, power: int = 2) -> Array:
-        """Eq. 25, (4, 4); `power` of the rate in c12 and c34 is printed as 2."""
+        """Return C' of eq. 25, shape (4, 4); the `power` of the rate in c12 and c34 is printed as 2."""
         l, c, m, _ = (self._column(k) for k in range(4))
         C = np.zeros((4, 4))
         for i, j in ((0, 1), (2, 3)):
@@ -56,7 +56,7 @@ class Printed:
         return C
 
     def h_tree(self, q_tree: Array) -> Array:
-        """Eq. 26, (4,)."""
+        """Return h' of eq. 26, shape (4,)."""
         l, c, m, _ = (self._column(k) for k in range(4))
         h = np.zeros(4)
         for i, j in ((0, 1), (2, 3)):
@@ -65,7 +65,7 @@ class Printed:
         return h
 
     def phi(self, q_tree: Array) -> Array:
-        """Eq. 27, (2,): the sum of angles at l3, theta_4 alone at l4."""
+        """Return phi of eq. 27, shape (2,): l3 has the sum of angles, l4 only theta_4."""
         l, (one, two, three, four) = self._column(0), q_tree
         angles, lengths = np.array([one, one + two, three + four, four]), l * [1, 1, -1, -1]
         return np.array([lengths @ np.cos(angles) - BASE, lengths @ np.sin(angles)])

@@ -1,4 +1,4 @@
-"""Sections III-B and III-C: the appendix's model, Figs. 3 and 4, the torques, the law of the tracking error."""
+"""Answer sections III-B and III-C: the appendix's model, Figs. 3 and 4, torques, decay of the tracking error."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from scripts.experiments.paper.printed import Printed
 __all__ = ["Law", "appendix_difference", "claims", "error_law", "plant"]
 
 STATES = 200
-STEADY = 4.0  # s, from when on the paper's 5 N m are read as meant
-FIRST, LATER = 30.0, 5.0  # N m, the paper's bounds
-AT = 9.5  # s
+STEADY = 4.0  # s: time from which the paper's bound of 5 N m is applied
+FIRST, LATER = 30.0, 5.0  # N m: the paper's bounds at first and in steady state
+AT = 9.5  # s: end of the tracking runs
 
 
 @dataclass(frozen=True)
 class Law:
-    """Tracking of eq. 21 to t = 9.5 s by one plant under one controller.
+    """Result of tracking eq. 21 to t = 9.5 s by one plant under one controller.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Law:
 
 
 def plant(mass: float = 1.0, gravity: float = 1.0) -> Mechanism:
-    """Return the five-bar with masses and inertias, and gravity, multiplied by factors."""
+    """Return the five-bar with masses and inertias multiplied by `mass`, and gravity by `gravity`."""
     mechanism = load(FIVE_BAR)
     model = mechanism.tree.model
     model.gravity.linear = gravity * model.gravity.linear
@@ -66,23 +66,23 @@ def plant(mass: float = 1.0, gravity: float = 1.0) -> Mechanism:
     return mechanism
 
 
-def error_law(name: str, own: Mechanism, believed: Mechanism | None = None, rtol: float = 1e-8) -> Law:
+def error_law(name: str, mechanism: Mechanism, believed: Mechanism | None = None, rtol: float = 1e-8) -> Law:
     """Track eq. 21 with the reduced model of one plant from the default five-bar's equilibrium.
 
     Parameters
     ----------
     name : str
-    own : Mechanism
+    mechanism : Mechanism
         The plant.
     believed : Mechanism, optional
-        What the controller takes the plant for; default: what it is.
+        The controller's model of the plant; by default the plant itself.
     rtol : float
     """
     _, desired, _ = tracking(FIVE_BAR)
-    model = ControllerModel(believed, own, "rho") if believed else None
+    model = ControllerModel(believed, mechanism, "rho") if believed else None
     controller = Tracking(np.eye(2), 10.0 * np.eye(2), desired, model)
-    start = own.kinematics(stable_equilibrium(load(FIVE_BAR)).q_tree)
-    reduced = LevelSet(own, start, np.zeros(2), make_force(controller, Actuation(own)), (0.0, AT))
+    start = mechanism.kinematics(stable_equilibrium(load(FIVE_BAR)).q_tree)
+    reduced = LevelSet(mechanism, start, np.zeros(2), make_force(controller, Actuation(mechanism)), (0.0, AT))
     u = [0.0]
 
     def note(solver: Any) -> None:
@@ -94,7 +94,7 @@ def error_law(name: str, own: Mechanism, believed: Mechanism | None = None, rtol
 
 
 def appendix_difference(name: str, rows: tuple[int, int, int, int]) -> tuple[float, float, float]:
-    """Return how far eqs. 24, 25 (rates to the first power, times v') and 26 are from Pinocchio, relative."""
+    """Return the relative differences of eqs. 24, 25 (with first powers, times v') and 26 from Pinocchio."""
     mechanism, printed, random = load(name), Printed(rows), np.random.default_rng(1)
     worst = np.zeros(3)
     for _ in range(STATES):
@@ -110,13 +110,13 @@ def appendix_difference(name: str, rows: tuple[int, int, int, int]) -> tuple[flo
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer what the appendix and section III state outside of the other studies."""
+    """Answer the statements of the appendix and of section III that no other study answers."""
     cases = {
         case: [simulate(f"{FIVE_BAR}/{case}", {"formulation": how}) for how in ("reduced", "spf")]
         for case in ("set_point", "tracking")
     }
     drawn = _plot([run for runs in cases.values() for run in runs], figures)
-    # steps as short as its z is wanted between them: Radau's interpolant is no match for its steps
+    # Output is needed between steps, where Radau's interpolant is less accurate than its steps: limit the steps.
     printed = {"formulation": "spf", "spf_coordinates": "z", "solver.max_step": 0.1}
     for case, runs in cases.items():
         runs.append(simulate(f"{FIVE_BAR}/{case}", printed))
@@ -137,7 +137,7 @@ def claims(figures: Path) -> list[Claim]:
 
 
 def _plot(runs: Sequence[Run], figures: Path) -> list[str]:
-    """Draw runs by the command that a reader has, ``ckc plot``."""
+    """Draw runs by ``ckc plot``, as a reader would."""
     with tempfile.TemporaryDirectory() as folder:
         saved = [str(run.save(Path(folder) / f"{k}.npz")) for k, run in enumerate(runs)]
         command = [sys.executable, "-m", "ckc_pin.cli", "plot", *saved, "--out", str(figures)]
@@ -148,8 +148,8 @@ def _plot(runs: Sequence[Run], figures: Path) -> list[str]:
 def _appendix() -> Claim:
     rows = []
     for name, numbers in ((FIVE_BAR, (1, 2, 4, 3)), (PRINTED, (1, 2, 3, 4))):
-        found = appendix_difference(name, numbers)
-        rows.append((name, ", ".join(map(str, numbers)), *(f"{x:.0e}" for x in found)))
+        differences = appendix_difference(name, numbers)
+        rows.append((name, ", ".join(map(str, numbers)), *(f"{x:.0e}" for x in differences)))
     good = all(float(cell) < 1e-12 for row in rows for cell in row[2:])
     return Claim(
         key="appendix",
@@ -173,7 +173,7 @@ def _equilibrium(run: Run) -> Claim:
 
 
 def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
-    q, u = _apart(runs)
+    q, u = _largest_differences(runs)
     spf = runs[1]
     target = [spf.scene["controller"]["q_d"][name] for name in spf.independent]
     error = max(float(np.abs(run.q_tree[-1][[0, 2]] - target).max()) for run in runs)
@@ -187,7 +187,7 @@ def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
 
 
 def _figure_4(runs: list[Run], drawn: list[str]) -> Claim:
-    q, u = _apart(runs)
+    q, u = _largest_differences(runs)
     return Claim(
         key="figure-4",
         verdict="holds" if q < 1e-6 and all(run.status == "done" for run in runs) else "does not hold",
@@ -246,7 +246,7 @@ def _how(run: Run) -> str:
     return "spf, eq. 8 as printed" if run.scene["spf_coordinates"] == "z" else str(run.scene["formulation"])
 
 
-def _apart(runs: list[Run]) -> tuple[float, float]:
-    """Largest differences in q' and in u of the reduced model and eq. 8 as printed."""
+def _largest_differences(runs: list[Run]) -> tuple[float, float]:
+    """Return the largest differences in q' and u between the reduced model and eq. 8 as printed."""
     a, _, b = runs
     return float(np.abs(a.q_tree - b.q_tree).max()), float(np.abs(a.u - b.u).max())

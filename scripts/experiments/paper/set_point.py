@@ -1,4 +1,4 @@
-"""The paper's statements on set-point control (section II-B), each with the experiment that answers it."""
+"""Answer the paper's statements on set-point control (section II-B)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.set_point_experiments import (
     DENSE,
     FORMULATIONS,
-    NEAR,
+    NEAR_START,
     SCENE,
     Case,
     along_run,
@@ -33,15 +33,15 @@ from scripts.experiments.paper.solutions import Equilibrium
 
 __all__ = ["ROWS", "claims", "gain_claim", "gradient_claim", "lyapunov_claim", "uniqueness_claim"]
 
-SAME = 1e-8  # relative: a spline's derivative of the recorded function against the formula
+RATE_TOLERANCE = 1e-8  # relative: derivative of the recorded function by a spline against the formula
 EXACT = 1e-9  # relative: differences of h against the chain rule
-DIVISIONS = 30  # of the certificates' lattices
+DIVISIONS = 30  # divisions of the certificates' lattices
 LOW_GAIN = {"controller.K_P": 0.5}
 ROWS: dict[str, dict[str, Any]] = {
     "equilibrium, K_P = 10 I": {},
     "equilibrium, K_P = 30 I": {"controller.K_P": 30.0},
-    "(0.3, 0.5), K_P = 10 I": NEAR,
-    "(0.3, 0.5), K_P = 2 I": {**NEAR, "controller.K_P": 2.0},
+    "(0.3, 0.5), K_P = 10 I": NEAR_START,
+    "(0.3, 0.5), K_P = 2 I": {**NEAR_START, "controller.K_P": 2.0},
     "equilibrium, K_P = 2 I": {"controller.K_P": 2.0},
     "equilibrium, K_P = 1 I": {"controller.K_P": 1.0},
     "equilibrium, K_P = 0.5 I": LOW_GAIN,
@@ -49,30 +49,30 @@ ROWS: dict[str, dict[str, Any]] = {
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Run the experiments on eqs. 14 and 15, write their figures into a folder, return the claims."""
+    """Run the experiments on eqs. 14 and 15 and write their figures into a folder; return the claims."""
     runs = {name: along_run({**DENSE, **how}) for name, how in FORMULATIONS.items()}
     cases = {name: load_case(overrides) for name, overrides in ROWS.items()}
     certificates = {name: (case, case.certificate(DIVISIONS)) for name, case in cases.items()}
-    case, own = next(iter(certificates.values()))
+    case, certificate = next(iter(certificates.values()))
     first_run = next(iter(runs.values()))[0]
     return [
         lyapunov_claim({name: record for name, (_, record) in runs.items()}, figures),
         gradient_claim(case, gradient_error(case.mechanism, 60), bounds(case.mechanism), figures),
-        gain_claim(case, own, certificates, first_run, figures),
+        gain_claim(case, certificate, certificates, first_run, figures),
         uniqueness_claim(certificates, {name: equilibria_of(case) for name, case in cases.items()}),
     ]
 
 
 def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
-    """Judge records of V_L by formulation."""
+    """Return the verdict on records of V_L by formulation."""
     rows = tuple(
         (name, f"{r.largest_increase:.1e}", f"{r.round_off:.1e}", f"{r.mismatch:.1e}") for name, r in records.items()
     )
-    holds = all(r.monotone and r.mismatch <= SAME for r in records.values())
+    confirmed = all(r.monotone and r.mismatch <= RATE_TOLERANCE for r in records.values())
     worst = max(r.largest_increase for r in records.values())
     return Claim(
         key="set-point-lyapunov",
-        verdict="holds" if holds else "does not hold",
+        verdict="holds" if confirmed else "does not hold",
         figures=(draw_lyapunov(records, figures),),
         table=(("formulation", "largest increase (J)", "rounding (J)", "rate: relative difference"), rows),
         **said(
@@ -85,21 +85,21 @@ def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
 
 
 def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list[list[Bound]], figures: Path) -> Claim:
-    """Judge bounds on dh/dq by branch, once it is what differences of h say."""
+    """Return the verdict on bounds of dh/dq by branch, given the comparison of dh/dq with differences of h."""
     error, asymmetry, used = checked
-    own, tail, gain = branches[0], branches[0][-2:], case.controller.K_P[0, 0]
+    assembled, tail, gain = branches[0], branches[0][-2:], case.controller.K_P[0, 0]
     exponent = np.log(tail[1].norm / tail[0].norm) / np.log(tail[0].margin / tail[1].margin)
     bounded = exponent < 0.1 and error <= EXACT
     rows = tuple(
         (f"{bound.margin:g}", *(f"{b[k].norm:.5g}" for b in branches), *(f"{b[k].low:.5g}" for b in branches))
-        for k, bound in enumerate(own)
+        for k, bound in enumerate(assembled)
     )
     of = ["assembled branch", *(f"branch {k + 2}" for k in range(len(branches) - 1))]
     return Claim(
         key="set-point-gradient-bound",
         verdict="holds" if bounded else "holds with a condition",
         figures=(draw_bounds(branches, case.controller.K_P, figures),),
-        table=(("|s| >=", *(f"M_1, {x}" for x in of), *(f"least eigenvalue, {x}" for x in of)), rows),
+        table=(("|s| >=", *(f"M_1, {x}" for x in of), *(f"smallest eigenvalue, {x}" for x in of)), rows),
         **said(
             "claims/set-point-gradient-bound",
             used=used,
@@ -108,53 +108,67 @@ def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list
             factor=tail[1].norm * tail[1].margin ** 3,
             exponent=exponent,
             gain=gain,
-            margin=_margin_where(own, gain),
+            margin=_margin_where(assembled, gain),
         ),
     )
 
 
 def _margin_where(branch: list[Bound], norm: float) -> float:
-    """Interpolate log M_1 over log s_min for the margin at which M_1 is a given value."""
+    """Return the margin at which M_1 has a given value, by interpolation of log M_1 over log s_min."""
     s, m = (np.log([getattr(bound, name) for bound in branch]) for name in ("margin", "norm"))
     return float(np.exp(np.interp(np.log(norm), m, s)))
 
 
 def gain_claim(
-    case: Case, own: Certificate, certificates: dict[str, tuple[Case, Certificate]], run: Run, figures: Path
+    case: Case, proof: Certificate, certificates: dict[str, tuple[Case, Certificate]], run: Run, figures: Path
 ) -> Claim:
-    """Judge what certificates say of the scene's own case, and of others."""
+    """Return the verdict by the certificate of the scene's case, with those of other cases in the table."""
     rows = tuple(
         (
             name,
             c.status,
             f"{c.level:.3g}",
             f"{c.safe_level:.3g}",
-            "undefined" if np.isnan(c.least_eigenvalue) else f"{c.least_eigenvalue:.3g}",
-            f"{c.least_margin:.3g}",
+            "undefined" if np.isnan(c.smallest_eigenvalue) else f"{c.smallest_eigenvalue:.3g}",
+            f"{c.smallest_margin:.3g}",
             f"{c.points}",
         )
         for name, (_, c) in certificates.items()
     )
-    entered = run.t[int(np.argmax(run.lyapunov <= own.safe_level))] if run.lyapunov is not None else np.nan
+    entered = run.t[int(np.argmax(run.lyapunov <= proof.safe_level))] if run.lyapunov is not None else np.nan
     certified = sum(c.status == "certified" for _, c in certificates.values())
     return Claim(
         key="set-point-gain-condition",
-        verdict="holds" if own.status == "certified" else "holds with a condition",
-        figures=(draw_set(case, own, run, DIVISIONS, figures),),
+        verdict="holds" if proof.status == "certified" else "holds with a condition",
+        figures=(draw_set(case, proof, run, DIVISIONS, figures),),
         table=(
-            ("start, gain", "verdict", "V_L(start) (J)", "safe up to (J)", "least eigenvalue", "least |s|", "points"),
+            (
+                "start, gain",
+                "verdict",
+                "V_L(start) (J)",
+                "safe up to (J)",
+                "smallest eigenvalue",
+                "smallest |s|",
+                "points",
+            ),
             rows,
         ),
-        **said("claims/set-point-gain-condition", own=own, entered=entered, cases=len(rows), certified=certified),
+        **said(
+            "claims/set-point-gain-condition",
+            certificate=proof,
+            entered=entered,
+            cases=len(rows),
+            certified=certified,
+        ),
     )
 
 
 def uniqueness_claim(
     certificates: dict[str, tuple[Case, Certificate]], solutions: Mapping[str, list[Equilibrium]]
 ) -> Claim:
-    """Judge whether eq. 15 has one solution where the gain condition is certified; the last case has a low gain."""
+    """Return the verdict on the uniqueness of eq. 15's solution in certified cases; the last case has a low gain."""
     unique = all(len(solutions[name]) == 1 for name, (_, c) in certificates.items() if c.status == "certified")
-    rows = tuple((name, certificates[name][1].status, *_count(found)) for name, found in solutions.items())
+    rows = tuple((name, certificates[name][1].status, *_count(some)) for name, some in solutions.items())
     own_name, low_name = next(iter(rows))[0], next(reversed(certificates))
     end = simulate(SCENE, {**LOW_GAIN, "t_end": 60.0})
     q = np.array([end.q_tree[-1, end.column(name)] for name in end.independent])
@@ -168,7 +182,7 @@ def uniqueness_claim(
         **said(
             "claims/set-point-unique",
             unique=unique,
-            own=len(solutions[own_name]),
+            solutions_of_scene=len(solutions[own_name]),
             low=len(solutions[low_name]),
             end=q,
             distance=distance,
@@ -177,9 +191,9 @@ def uniqueness_claim(
     )
 
 
-def _count(found: list[Equilibrium]) -> tuple[str, str, str]:
-    minima = [f"({_numbers(x.q)})" for x in found if x.kind == "minimum"]
-    return str(len(found)), str(len(minima)), " ".join(minima)
+def _count(equilibria: list[Equilibrium]) -> tuple[str, str, str]:
+    minima = [f"({_numbers(x.q)})" for x in equilibria if x.kind == "minimum"]
+    return str(len(equilibria)), str(len(minima)), " ".join(minima)
 
 
 def _numbers(q: Array) -> str:

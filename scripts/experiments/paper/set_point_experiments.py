@@ -1,4 +1,4 @@
-"""Experiments on set-point control (eqs. 14 and 15); `scripts.experiments.paper.set_point` turns them into claims."""
+"""Experiments on set-point control (eqs. 14 and 15), which `scripts.experiments.paper.set_point` evaluates."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from scripts.experiments.paper.solutions import Equilibrium, equilibria
 __all__ = [
     "DENSE",
     "FORMULATIONS",
-    "NEAR",
+    "NEAR_START",
     "SCENE",
     "Case",
     "along_run",
@@ -42,11 +42,14 @@ __all__ = [
 SCENE = "five_bar/set_point"
 MARGINS = (0.8, 0.5, 0.3, 0.1, 0.05)
 DENSE = {"solver.rtol": 1e-12, "solver.method": "DOP853", "solver.output_dt": 5e-4, "t_end": 2.0}
-NEAR = {"initial.at": None, "initial.q": {"theta_1": 0.3, "theta_3": 0.5}}  # a start half a radian from the target
+NEAR_START = {
+    "initial.at": None,
+    "initial.q": {"theta_1": 0.3, "theta_3": 0.5},
+}  # half a radian from q_d
 FORMULATIONS: dict[str, dict[str, Any]] = {
     "reduced, eq. 6": {"formulation": "reduced"},
     "SPF, eq. 17": {"formulation": "spf"},
-    # explicit methods are bound to steps of epsilon in eq. 8 as printed
+    # Eq. 8 as printed limits explicit methods to steps of the size of epsilon.
     "SPF, eq. 8": {"formulation": "spf", "spf_coordinates": "z", "solver.method": "Radau", "solver.rtol": 1e-10},
     "DAE, eq. 1": {"formulation": "dae"},
 }
@@ -54,7 +57,7 @@ FORMULATIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A set-point scene, ready to be asked about."""
+    """A set-point scene with its mechanism, controller and start."""
 
     mechanism: Mechanism
     controller: SetPoint
@@ -66,12 +69,12 @@ class Case:
         return level_of(self.mechanism, self.controller, self.start)
 
     def certificate(self, divisions: int = 50) -> Certificate:
-        """Decide on the gain condition for this start."""
+        """Return the certificate of the gain condition for this start."""
         return certify(self.mechanism, self.controller, self.start, divisions)
 
 
 def load_case(overrides: Mapping[str, Any] | None = None, scene: str | Path = SCENE) -> Case:
-    """Load a set-point scene, with values replaced by dotted key.
+    """Load a set-point scene, with overrides by dotted key.
 
     Raises
     ------
@@ -87,7 +90,7 @@ def load_case(overrides: Mapping[str, Any] | None = None, scene: str | Path = SC
 
 
 def along_run(overrides: Mapping[str, Any], scene: str | Path = SCENE) -> tuple[Run, Record]:
-    """Run a scene and compare V_L's rate with -q_dot^T K_V q_dot."""
+    """Run a scene and compare the rate of V_L with -q_dot^T K_V q_dot."""
     case = load_case(overrides, scene)
     run = simulate(scene, overrides)
     q_dot = run.v_tree[:, [run.column(name) for name in run.independent]]
@@ -102,7 +105,7 @@ def gradient_error(mechanism: Mechanism, count: int, seed: int = 0, step: float 
     error, asymmetry : float
         Largest difference from fourth-order central differences, and of dh/dq from its transpose, relative to |dh/dq|.
     used : int
-        Configurations that were reached, |s| >= 0.05.
+        Number of configurations with |s| >= 0.05 that were reached.
     """
     random = np.random.default_rng(seed)
     error = asymmetry = 0.0
@@ -118,7 +121,7 @@ def gradient_error(mechanism: Mechanism, count: int, seed: int = 0, step: float 
             dq[k] = distance
             return Terms(mechanism, follow(mechanism, at, dq)[0], np.zeros(mechanism.n)).h
 
-        reach = step * margin(at) ** 2  # h bends ever more towards singularity
+        reach = step * margin(at) ** 2  # the curvature of h grows towards singular configurations
         columns = [
             (8 * (h(k, reach) - h(k, -reach)) - (h(k, 2 * reach) - h(k, -2 * reach))) / (12 * reach)
             for k in range(mechanism.d)
@@ -140,8 +143,8 @@ def bounds(mechanism: Mechanism, margins: Sequence[float] = MARGINS, divisions: 
 
 
 def equilibria_of(case: Case, divisions: int = 16, starts: int = 80) -> list[Equilibrium]:
-    """Solve eq. 15 from points spread over the sublevel set that a case starts in; return the solutions in it."""
-    found = sublevel_set(case.mechanism, case.controller, case.level, divisions)
-    nodes = found.explored.nodes[:: max(1, len(found.explored.nodes) // starts)]
+    """Return the solutions of eq. 15 in the sublevel set of a case's start, by Newton from points spread over it."""
+    region = sublevel_set(case.mechanism, case.controller, case.level, divisions)
+    nodes = region.explored.nodes[:: max(1, len(region.explored.nodes) // starts)]
     solutions = equilibria(case.mechanism, case.controller, nodes)
     return [solution for solution in solutions if solution.height <= case.level]

@@ -23,7 +23,7 @@ STYLES = ("-", "--", ":", "-.")
 
 
 def draw_lyapunov(records: Mapping[str, Record], folder: Path) -> str:
-    """V_L and its rate along runs of several formulations."""
+    """Draw V_L and its rate along runs of several formulations."""
     figure, (left, right) = chart(2)
     for (name, record), colour, style in zip(records.items(), COLOURS, STYLES, strict=False):
         left.semilogy(record.t, np.maximum(record.value, 1e-18), style, color=colour, label=name)
@@ -39,7 +39,7 @@ def draw_lyapunov(records: Mapping[str, Record], folder: Path) -> str:
 
 
 def draw_bounds(branches: list[list[Bound]], K_P: Array, folder: Path) -> str:
-    """M_1 and the least eigenvalue over |s| >= s_min."""
+    """Draw M_1 and the smallest eigenvalue over |s| >= s_min."""
     figure, (ax,) = chart()
     margins = np.array([bound.margin for bound in branches[0]])
     for k, bounds in enumerate(branches):
@@ -52,7 +52,7 @@ def draw_bounds(branches: list[list[Bound]], K_P: Array, folder: Path) -> str:
             color=COLOURS[k],
             label=rf"largest $|\partial h/\partial q|$, {of}",
         )
-        ax.loglog(margins, -lows, "s--", color=COLOURS[k + 2], label=f"minus the least eigenvalue, {of}")
+        ax.loglog(margins, -lows, "s--", color=COLOURS[k + 2], label=f"minus the smallest eigenvalue, {of}")
     tail = branches[0][-1]
     fit = tail.norm * (margins / tail.margin) ** -3.0
     ax.loglog(margins, fit, color=BLACK, linewidth=0.8, label=rf"{tail.norm * tail.margin**3:.3f} / $s_{{\min}}^3$")
@@ -69,12 +69,12 @@ def draw_bounds(branches: list[list[Bound]], K_P: Array, folder: Path) -> str:
 
 
 def draw_set(case: Case, certificate: Certificate, run: Run, divisions: int, folder: Path) -> str:
-    """The sublevel set that a start lies in, where the gain condition fails on it, and the run (d = 2)."""
+    """Draw the sublevel set of a start, the region where the gain condition fails, and the run (d = 2)."""
     figure, (ax,) = chart()
-    found = sublevel_set(case.mechanism, case.controller, case.level, divisions)
-    q, ends = (_plane(case, ats) for ats in (found.explored.nodes, [end.at for end in found.explored.ends]))
-    height = np.array([rest_height(case.mechanism, case.controller, at) for at in found.explored.nodes])
-    fails, safe = found.eigenvalues <= 0, height <= certificate.safe_level
+    region = sublevel_set(case.mechanism, case.controller, case.level, divisions)
+    q, ends = (_plane(case, ats) for ats in (region.explored.nodes, [end.at for end in region.explored.ends]))
+    height = np.array([rest_height(case.mechanism, case.controller, at) for at in region.explored.nodes])
+    fails, safe = region.eigenvalues <= 0, height <= certificate.safe_level
     dots: dict[str, Any] = {"s": 14 * (50 / divisions) ** 2, "marker": "s", "linewidths": 0}
     ax.scatter(
         *q[~fails & ~safe].T, color="#dddddd", label=f"connected to $q_d$, $V_L$ ≤ {certificate.level:.1f} J", **dots

@@ -1,4 +1,4 @@
-"""Section III-A and Fig. 2: type 1, type 2, and the freedoms that are said to be lost there."""
+"""Answer section III-A and Fig. 2: singularities of types 1 and 2, and whether freedoms are lost there."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED, Links, elbow_d
 __all__ = ["Locus", "claims", "loci"]
 
 STARTS = 60
-SAME = 1e-6  # rad: configurations on one curve
+SAME_CURVE_RAD = 1e-6  # largest distance of a configuration from a curve that it lies on
 
 
 @dataclass(frozen=True)
 class Locus:
-    """A curve of singular configurations of a five-bar and what is measured along it.
+    """A curve of singular configurations of a five-bar, with measurements along it.
 
     Attributes
     ----------
     name : "type 1", "type 2" or "type 1, opened"
-        The paper's name; the last one where l2 and l4 differ, elbows |l2 - l4| apart.
+        The paper's name. "type 1, opened" is type 1 with l2 != l4, where the elbows are |l2 - l4| apart.
     point : SingularPoint
         One of its configurations.
     curve : SingularCurve
@@ -42,8 +42,8 @@ class Locus:
         Its projection on (theta_1, theta_3), each within [-pi, pi).
     sigma_min_J : float
         Smallest along the curve.
-    least_chart : float
-        The best of all charts' sigma_min(phi_z), where that is smallest along the curve.
+    smallest_chart : float
+        Smallest value along the curve of the best chart's sigma_min(phi_z).
     """
 
     name: str
@@ -51,23 +51,23 @@ class Locus:
     curve: SingularCurve
     q: Array
     sigma_min_J: float
-    least_chart: float
+    smallest_chart: float
 
 
 def loci(mechanism: Mechanism, starts: int = STARTS) -> list[Locus]:
-    """Search for singular configurations and trace the curve through each that is on no curve yet."""
-    found: list[Locus] = []
+    """Search for singular configurations and trace a curve through each one that is on no other curve."""
+    curves: list[Locus] = []
     for point in search_singular(mechanism, starts):
-        if not any(_on(point, locus) for locus in found):
-            found.append(_measure(mechanism, point, trace_singular(mechanism, point)))
-    return sorted(found, key=lambda locus: (locus.point.kind, *np.round(locus.q[0], 6)), reverse=True)
+        if not any(_on(point, locus) for locus in curves):
+            curves.append(_measure(mechanism, point, trace_singular(mechanism, point)))
+    return sorted(curves, key=lambda locus: (locus.point.kind, *np.round(locus.q[0], 6)), reverse=True)
 
 
 def _on(point: SingularPoint, locus: Locus) -> bool:
-    """Whether a curve comes as near to a configuration as its own points are to each other."""
+    """Whether a configuration is as near to a curve as the curve's points are to each other."""
     away = np.abs(wrap(locus.curve.q_tree - point.at.q_tree)).max(axis=1)
     stride = np.abs(wrap(np.diff(locus.curve.q_tree, axis=0))).max()
-    return bool(away.min() <= max(stride, SAME) and point.kind == locus.point.kind)
+    return bool(away.min() <= max(stride, SAME_CURVE_RAD) and point.kind == locus.point.kind)
 
 
 def _measure(mechanism: Mechanism, point: SingularPoint, curve: SingularCurve) -> Locus:
@@ -82,36 +82,36 @@ def _measure(mechanism: Mechanism, point: SingularPoint, curve: SingularCurve) -
         curve=curve,
         q=q,
         sigma_min_J=min(float(np.linalg.svd(at.J, compute_uv=False)[mechanism.rank - 1]) for at in along),
-        least_chart=min(best),
+        smallest_chart=min(best),
     )
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer section III-A."""
+    """Answer the statements of section III-A."""
     mechanisms = {name: load(name) for name in (FIVE_BAR, PRINTED)}
-    found = {name: loci(mechanism) for name, mechanism in mechanisms.items()}
-    every = [(name, locus) for name in found for locus in found[name]]
-    crossings = [(name, locus.name, cross(mechanisms[name], locus.point)) for name, locus in every]
-    map_ = _draw_map(figures, found)
+    by_mechanism = {name: loci(mechanism) for name, mechanism in mechanisms.items()}
+    all_loci = [(name, locus) for name in by_mechanism for locus in by_mechanism[name]]
+    crossings = [(name, locus.name, cross(mechanisms[name], locus.point)) for name, locus in all_loci]
+    map_ = _draw_map(figures, by_mechanism)
     through = _draw_crossings(figures, crossings)
     return [
-        _type_1(found, map_),
-        _type_2(found, map_),
-        _freedoms(every, crossings, through),
+        _type_1(by_mechanism, map_),
+        _type_2(by_mechanism, map_),
+        _freedoms(all_loci, crossings, through),
     ]
 
 
-def _type_1(found: dict[str, list[Locus]], figure: str) -> Claim:
-    ours = [locus for locus in found[FIVE_BAR] if locus.name == "type 1"]
-    printed = [locus for locus in found[PRINTED] if locus.name == "type 1"]
+def _type_1(by_mechanism: dict[str, list[Locus]], figure: str) -> Claim:
+    ours = [locus for locus in by_mechanism[FIVE_BAR] if locus.name == "type 1"]
+    printed = [locus for locus in by_mechanism[PRINTED] if locus.name == "type 1"]
     spread = max(float(np.ptp(locus.curve.q_tree[:, [0, 2]], axis=0).max()) for locus in ours)
     turn = min(float(np.abs(np.diff(np.unwrap(locus.curve.q_tree[:, 1]))).sum()) for locus in ours)
     lengths = links(load(PRINTED))
     opening = abs(lengths.l2 - lengths.l4)
-    small = [locus for locus in found[PRINTED] if locus.name == "type 1, opened"]
+    small = [locus for locus in by_mechanism[PRINTED] if locus.name == "type 1, opened"]
     apart = [elbow_distance(lengths, *locus.q.T) for locus in small]
     gap = max((float(np.abs(x - opening).max()) for x in apart), default=float("nan"))
-    fold = min(abs(locus.point.fold) for locus in found[PRINTED])
+    fold = min(abs(locus.point.fold) for locus in by_mechanism[PRINTED])
     return Claim(
         key="singular-type-1",
         verdict="holds with a condition" if len(ours) == 2 and not printed else "does not hold",
@@ -131,9 +131,9 @@ def _type_1(found: dict[str, list[Locus]], figure: str) -> Claim:
     )
 
 
-def _type_2(found: dict[str, list[Locus]], figure: str) -> Claim:
+def _type_2(by_mechanism: dict[str, list[Locus]], figure: str) -> Claim:
     rows, good = [], True
-    for name, some in found.items():
+    for name, some in by_mechanism.items():
         lengths = links(load(name))
         for locus in some:
             if locus.name != "type 2":
@@ -151,31 +151,31 @@ def _type_2(found: dict[str, list[Locus]], figure: str) -> Claim:
     )
 
 
-def _freedoms(every: list[tuple[str, Locus]], crossings: Sequence[tuple[str, str, Crossing]], figure: str) -> Claim:
+def _freedoms(all_loci: list[tuple[str, Locus]], crossings: Sequence[tuple[str, str, Crossing]], figure: str) -> Claim:
     rows = []
-    for name, locus in every:
+    for name, locus in all_loci:
         point = locus.point
         rows.append((
             name, locus.name, f"{point.rank_J}, {point.freedoms}", f"{locus.sigma_min_J:.4f}",
             f"{np.linalg.matrix_rank(point.at.phi_z, tol=1e-9)}", f"{point.q_rank}",
-            f"{', '.join(point.chart)}: {point.chart_sigma_min:.3f}", f"{locus.least_chart:.3f}",
+            f"{', '.join(point.chart)}: {point.chart_sigma_min:.3f}", f"{locus.smallest_chart:.3f}",
         ))  # fmt: skip
-    kept = all(locus.point.freedoms == 2 and locus.sigma_min_J > 1e-3 for _, locus in every)
+    kept = all(locus.point.freedoms == 2 and locus.sigma_min_J > 1e-3 for _, locus in all_loci)
     passed = [c for _, _, c in crossings]
     return Claim(
         key="singular-freedoms",
         verdict="does not hold" if kept else "holds",
         figures=(figure,),
         table=(
-            ("mechanism", "singularity", "rank J, freedoms", "least sigma_min(J)", "rank phi_z", "rank of q-part",
-             "a chart there: sigma_min", "least along curve"),
+            ("mechanism", "singularity", "rank J, freedoms", "smallest sigma_min(J)", "rank phi_z", "rank of q-part",
+             "a chart there: sigma_min", "smallest along curve"),
             tuple(rows),
         ),
         **said(
             "claims/singular-freedoms",
-            curves=len(every),
-            sigma_min_J=min(locus.sigma_min_J for _, locus in every),
-            least_chart=min(locus.least_chart for _, locus in every),
+            curves=len(all_loci),
+            sigma_min_J=min(locus.sigma_min_J for _, locus in all_loci),
+            smallest_chart=min(locus.smallest_chart for _, locus in all_loci),
             half=abs(passed[0].t[0]),
             returned=max(c.returned for c in passed),
             drift=max(c.energy_drift for c in passed),
@@ -185,12 +185,12 @@ def _freedoms(every: list[tuple[str, Locus]], crossings: Sequence[tuple[str, str
     )  # fmt: skip
 
 
-def _draw_map(figures: Path, found: dict[str, list[Locus]]) -> str:
+def _draw_map(figures: Path, by_mechanism: dict[str, list[Locus]]) -> str:
     figure, axes = chart(2)
     grid = np.linspace(-np.pi, np.pi, 401)
     theta_1, theta_3 = np.meshgrid(grid, grid)
     t = np.linspace(0.0, 2 * np.pi, 400)
-    for ax, (name, some) in zip(axes, found.items(), strict=True):
+    for ax, (name, some) in zip(axes, by_mechanism.items(), strict=True):
         lengths = links(load(name))
         _shade(ax, theta_1, theta_3, lengths)
         for locus in some:
@@ -219,7 +219,7 @@ def _draw_locus(ax: Any, locus: Locus) -> None:
         ax.plot(*locus.q[0], "o", color=colour, ms=8, label="type 1: elbows coincide")
         return
     q = locus.q.copy()
-    q[1:][np.abs(np.diff(locus.q, axis=0)).max(axis=1) > np.pi] = np.nan  # do not draw across the seam of the angles
+    q[1:][np.abs(np.diff(locus.q, axis=0)).max(axis=1) > np.pi] = np.nan  # interrupt the line where an angle wraps
     label = "type 2: elbows l2 + l4 apart" if locus.name == "type 2" else "elbows |l2 - l4| apart"
     ax.plot(*q.T, color=colour, lw=2, label=label)
 
@@ -233,7 +233,7 @@ def _draw_crossings(figures: Path, crossings: Sequence[tuple[str, str, Crossing]
         right.plot(1e3 * crossing.t, crossing.sigma_min_J, color=colour, lw=2, label=f"{name} crossed")
     left.axhline(0.0, color=BLACK, lw=0.8)
     left.set(xlabel="$t$ (ms)", ylabel=r"$\det\varphi_z$ (m²)", title="the chart (θ₁, θ₃) fails ...")
-    right.set(xlabel="$t$ (ms)", ylabel="least singular value of J (m)", title="... the mechanism does not")
+    right.set(xlabel="$t$ (ms)", ylabel="smallest singular value of J (m)", title="... the mechanism does not")
     right.set_ylim(0.0, 1.2 * max(crossing.sigma_min_J.max() for crossing in shown.values()))
     for ax in (left, right):
         ax.legend()

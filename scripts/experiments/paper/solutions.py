@@ -1,4 +1,4 @@
-"""The equilibria of the set-point controller: solutions of eq. 15, found from many starts.
+"""Find the equilibria of the set-point controller, the solutions of eq. 15, from many starts.
 
 Eq. 14 at rest is u = h(q), that is h(q) - h(q_d) = K_P (q_d - q); eq. 15 prints its left side with the other sign.
 """
@@ -22,9 +22,9 @@ from scripts.experiments.certificate.certificate import rest_height
 
 __all__ = ["Equilibrium", "equilibria"]
 
-LONGEST = 0.2  # rad or m: a longer Newton step is not local any more
+LONGEST = 0.2  # rad or m: limit of a Newton step
 ITERATIONS = 60
-SOLVED = 1e-10  # N m or N, of K_P's size
+SOLVED = 1e-10  # residual in N m or N, relative to K_P
 
 Kind = Literal["minimum", "saddle", "maximum"]
 
@@ -38,52 +38,52 @@ class Equilibrium:
     q : (d,) array
     at : Kinematics
     kind : "minimum", "saddle" or "maximum"
-        Of V_L(q, 0): the closed loop is stable at a minimum only.
+        Type of the critical point of V_L(q, 0). The closed loop is stable at minima only.
     height : float
         V_L there, J; zero at q_d.
-    found : int
-        From how many of the starts Newton ended there.
+    starts : int
+        Number of starts from which Newton converged to it.
     """
 
     q: Array
     at: Kinematics
     kind: Kind
     height: float
-    found: int
+    starts: int
 
 
 def equilibria(mechanism: Mechanism, controller: SetPoint, starts: Iterable[Kinematics]) -> list[Equilibrium]:
-    """Solve eq. 15 by Newton from many closed configurations and keep the distinct solutions, lowest V_L first.
+    """Solve eq. 15 by Newton from many closed configurations; return the distinct solutions, lowest V_L first.
 
-    Angles a whole turn apart are different solutions: K_P (q_d - q) tells them apart.
+    Angles that differ by a whole turn are different solutions, since K_P (q_d - q) differs.
     """
-    found: list[tuple[Kinematics, int]] = []
+    distinct: list[tuple[Kinematics, int]] = []
     for start in starts:
         at = _solve(mechanism, controller, start)
         if at is None:
             continue
-        for k, (known, times) in enumerate(found):
-            apart = mechanism.independent_part(at.q_tree) - mechanism.independent_part(known.q_tree)
-            if np.abs(apart).max(initial=0.0) < 1e-6 and same_configuration(mechanism, known, at):
-                found[k] = (known, times + 1)
+        for k, (solution, times) in enumerate(distinct):
+            apart = mechanism.independent_part(at.q_tree) - mechanism.independent_part(solution.q_tree)
+            if np.abs(apart).max(initial=0.0) < 1e-6 and same_configuration(mechanism, solution, at):
+                distinct[k] = (solution, times + 1)
                 break
         else:
-            found.append((at, 1))
+            distinct.append((at, 1))
     solutions = [
         Equilibrium(
             q=mechanism.independent_part(at.q_tree),
             at=at,
             kind=_kind(controller.K_P + h_gradient(mechanism, at)),
             height=rest_height(mechanism, controller, at),
-            found=times,
+            starts=times,
         )
-        for at, times in found
+        for at, times in distinct
     ]
     return sorted(solutions, key=lambda solution: solution.height)
 
 
 def _solve(mechanism: Mechanism, controller: SetPoint, at: Kinematics) -> Kinematics | None:
-    """Newton on grad U = h(q) - h(q_d) + K_P (q - q_d) along the branch, steps cut to what is local."""
+    """Solve grad U = h(q) - h(q_d) + K_P (q - q_d) = 0 by Newton along the branch, with limited steps."""
     for _ in range(ITERATIONS):
         terms = Terms(mechanism, at, np.zeros(mechanism.n))
         slope = terms.h - controller.target.h + controller.K_P @ (terms.q - controller.q_d)

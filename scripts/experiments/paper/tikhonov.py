@@ -1,7 +1,7 @@
-"""Tikhonov's theorem for the SPF (eqs. 9 to 13): how far it is from the DAE at t = 1 s, against epsilon.
+"""Tikhonov's theorem for the SPF (eqs. 9 to 13): difference from the DAE at t = 1 s against epsilon.
 
-From a consistent start the SPF is the DAE (see `consistent_start`), so the study starts off the manifold:
-the same q and q_dot in both systems, z on phi = 0 in the DAE and on phi = w(0) in the SPF.
+From a consistent start both have the same solution (see `consistent_start`). So the study starts off the manifold, with
+the same q and q_dot in both systems, z on phi = 0 in the DAE, and z on phi = w(0) in the SPF.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["EPSILONS", "Convergence", "claims", "converge", "order_claim", "velo
 
 EPSILONS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 T_END = 1.0
-FIRST, SECOND = ("DOP853", 1e-12), ("LSODA", 1e-12)  # two integrations that share neither method nor code
+FIRST, SECOND = ("DOP853", 1e-12), ("LSODA", 1e-12)  # two integrations with different methods and codes
 ORDER_MARGIN = 0.05
 
 
 @dataclass(frozen=True)
 class Convergence:
-    """The SPF against the DAE for a row of epsilons.
+    """Differences of the SPF from the DAE for a sequence of epsilons.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Convergence:
     x, z : (m,) arrays
         Largest difference in (q, q_dot) and in z at t_end.
     x_uncertainty, z_uncertainty : (m,) arrays
-        By how much the second pair of integrations gives another difference.
+        Change of the difference by the second pair of integrations.
     """
 
     epsilons: Array
@@ -59,7 +59,7 @@ class Convergence:
 
     @property
     def resolved(self) -> bool:
-        """Whether the integration's error is below a tenth of every difference."""
+        """Whether the integration errors are below a tenth of each difference."""
         return bool(np.all(10 * self.x_uncertainty < self.x) and np.all(10 * self.z_uncertainty < self.z))
 
 
@@ -75,10 +75,10 @@ def converge(
     t_end: float = T_END,
     reference: Problem | None = None,
 ) -> Convergence:
-    """Measure the SPF of eq. 8, integrated in the coordinates of eq. 17, against the DAE of eq. 1.
+    """Measure the difference of the SPF (eq. 8 in the coordinates of eq. 17) from the DAE of eq. 1.
 
-    Every difference is measured twice: DOP853 for both systems, and LSODA for the SPF and the reduced
-    model in the DAE's place.
+    Each difference is measured twice: with DOP853 for both systems, and with LSODA for the SPF and for the reduced
+    model in place of the DAE.
 
     Parameters
     ----------
@@ -88,16 +88,16 @@ def converge(
         w(0) of the SPF.
     epsilons : sequence of float
     convention : "rho" or "actual"
-        Where C takes its velocity, eq. 8's way or eq. 16's.
+        Velocity at which C is evaluated: that of eq. 8 or that of eq. 16.
     t_end : float
-        When the two are compared, s.
+        Time of the comparison, s.
     reference : Problem, optional
-        Where the DAE starts, when not from `problem`.
+        Start of the DAE, by default that of `problem`.
 
     Raises
     ------
     NumericalError
-        A start that cannot be closed, or a run that stops.
+        A start cannot be closed, or a run stops.
     """
     reference = reference or problem
     dae = end_of(reference.dae(), *FIRST, t_end)
@@ -111,7 +111,7 @@ def converge(
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Answer what the paper claims of the order of the error, and which C it is true of."""
+    """Answer the paper's claim on the order of the error, for both definitions of C."""
     rest, moving = five_bar_problem(False), five_bar_problem(True)
     start = f"w(0) = {vector(W0)} m, q̇(0) = 0 or {vector(moving.q_dot)} rad/s"
     rho = converge(rest, W0), converge(moving, W0)

@@ -1,4 +1,4 @@
-"""The paper's statements on tracking control (sections II-C and III-C), each with the experiment that answers it."""
+"""Answer the paper's statements on tracking control (sections II-C and III-C)."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from scripts.experiments.paper.tracking_identities import Skewness, claimed_form
 
 __all__ = ["accepted", "claims", "deviations_claim", "gains_claim", "lyapunov_claim", "skew_claim"]
 
-SAME = 1e-7  # relative: a spline's derivative of the recorded function against eq. 19
+RATE_TOLERANCE = 1e-7  # relative: derivative of the recorded function by a spline against eq. 19
 SKEW = 1e-8  # relative: differences of D against C
-EXACT = 1e-8  # rad: what tight tolerances leave of a difference
-SEEN = 1e-7  # rad: smaller deviations are rounding's, whose period means nothing
+EXACT = 1e-8  # rad: largest difference at tight tolerances
+SEEN = 1e-7  # rad: smaller deviations are rounding errors, whose period has no meaning
 SHOWN = (
     "controller's own sigma to 1e-2 m",
     "reduced: BDF, rtol 1e-2",
@@ -46,16 +46,16 @@ SHOWN = (
     "SPF, eq. 8: Radau, rtol 1e-3",
     "sigma of both to 1e-2 m",
 )
-PERIODIC = 0.9  # share of a deviation's variance that repeats
+PERIODIC = 0.9  # share of a deviation's variance from which it counts as periodic
 STATES = 30
-LAYERS = (1e-3, 1e-4)  # epsilon of runs through the boundary layer; the first is drawn
+LAYERS = (1e-3, 1e-4)  # epsilons of runs through the boundary layer; the first run is drawn
 
 VELOCITY: dict[CoriolisVelocity, str] = {"rho": "rho q_dot", "actual": "the actual velocity"}
-OffManifold = tuple[float, CoriolisVelocity, bool]  # epsilon, where C takes its velocity, whether it starts moving
+OffManifold = tuple[float, CoriolisVelocity, bool]  # epsilon, velocity of C, whether the run starts moving
 
 
 def claims(figures: Path) -> list[Claim]:
-    """Run the experiments on eqs. 16 to 19, write their figures into a folder, return the claims."""
+    """Run the experiments on eqs. 16 to 19 and write their figures into a folder; return the claims."""
     first = {name: lyapunov_along({**how, **START}) for name, how in ON_MANIFOLD.items()}
     later = {name: lyapunov_along({**how, **WHOLE}, SINCE) for name, how in ON_MANIFOLD.items()}
     off = {
@@ -80,7 +80,7 @@ def claims(figures: Path) -> list[Claim]:
 def lyapunov_claim(
     first: Mapping[str, Record], later: Mapping[str, Record], off: Mapping[OffManifold, Record], figures: Path
 ) -> Claim:
-    """Judge records from w(0) = 0, by formulation, and from off the manifold."""
+    """Return the verdict on records from w(0) = 0 by formulation, and on records from off the manifold."""
     rows = [(name, "0", "either", *_cells(x)) for name in first for x in (first[name], later[name])]
     rows += [
         (f"SPF, eq. 17, ε = {epsilon:g}, {'moving' if moving else 'at rest'}", str(W0), VELOCITY[name], *_cells(x))
@@ -88,14 +88,14 @@ def lyapunov_claim(
     ]
     on = [*first.values(), *later.values()]
     rho, actual = (max(x.mismatch for key, x in off.items() if key[1] == name) for name in VELOCITY)
-    kept = all(x.mismatch <= SAME and x.monotone for x in on) and actual <= SAME
+    kept = all(x.mismatch <= RATE_TOLERANCE and x.monotone for x in on) and actual <= RATE_TOLERANCE
     rising = sum(not x.monotone for x in (*on, *off.values()))
     whole = next(iter(later.values()))
     layer = next(iter(off))[0]
     drawn = {f"C at {VELOCITY[name]}": off[layer, name, True] for name in VELOCITY}
     return Claim(
         key="tracking-lyapunov",
-        verdict="does not hold" if not kept else "holds" if rho <= SAME else "holds with a condition",
+        verdict="does not hold" if not kept else "holds" if rho <= RATE_TOLERANCE else "holds with a condition",
         figures=(draw_lyapunov(whole, drawn, layer, figures),),
         table=(("run", "w(0) (m)", "C at", "t (s)", "rate: relative difference", "V rises by (J)"), tuple(rows)),
         **said(
@@ -118,19 +118,19 @@ def _cells(record: Record) -> tuple[str, str, str]:
     return span, f"{record.mismatch:.1e}", "-" if record.largest_increase <= 0 else f"{record.largest_increase:.1e}"
 
 
-# --- what eq. 19 rests on ----------------------------------------------------------------------------------------
+# --- assumptions of eq. 19 ---------------------------------------------------------------------------------------
 
 
-def skew_claim(found: Mapping[float, Skewness]) -> Claim:
-    """Judge how skew D_dot - 2 C is, by epsilon."""
+def skew_claim(by_epsilon: Mapping[float, Skewness]) -> Claim:
+    """Return the verdict on the skew-symmetry of D_dot - 2 C, by epsilon."""
     rows = tuple(
         (f"{e:g}", f"{x.on:.1e}", f"{x.off_rho_rho:.1e}", f"{x.off_actual_actual:.1e}", f"{x.off_actual_rho:.2g}")
-        for e, x in found.items()
+        for e, x in by_epsilon.items()
     )
     on, level, actual = (
-        max(getattr(x, name) for x in found.values()) for name in ("on", "off_rho_rho", "off_actual_actual")
+        max(getattr(x, name) for x in by_epsilon.values()) for name in ("on", "off_rho_rho", "off_actual_actual")
     )
-    mixed = [x.off_actual_rho for x in found.values()]
+    mixed = [x.off_actual_rho for x in by_epsilon.values()]
     return Claim(
         key="tracking-skew",
         verdict=(
@@ -144,7 +144,7 @@ def skew_claim(found: Mapping[float, Skewness]) -> Claim:
             rows,
         ),
         **said(
-            "claims/tracking-skew", states=next(iter(found.values())).states, on=on, actual=actual,
+            "claims/tracking-skew", states=next(iter(by_epsilon.values())).states, on=on, actual=actual,
             mixed=(min(mixed), max(mixed)), level=level,
         ),
     )  # fmt: skip
@@ -162,7 +162,7 @@ GAINS: dict[str, tuple[Array, Array]] = {
 
 
 def gains_claim() -> Claim:
-    """Judge eqs. 18 and 19 as quadratic forms for gains of several kinds."""
+    """Return the verdict on eqs. 18 and 19 as quadratic forms, for several kinds of gains."""
     rows, fits, misfits = [], list[float](), list[float]()
     for name, (Lambda, K_D) in GAINS.items():
         A, form = Lambda.T @ K_D, rate_form(Lambda, K_D)
@@ -176,7 +176,7 @@ def gains_claim() -> Claim:
         verdict="holds with a condition" if max(fits) <= 1e-10 < min(misfits) else "does not hold",
         table=(
             ("gains", "Lambda^T K_D symmetric", "last line: off by", "line before: off by",
-             "least eigenvalue: Lambda^T K_D", "least eigenvalue: -dV_1/dt", "accepted by the program"),
+             "smallest eigenvalue: Lambda^T K_D", "smallest eigenvalue: -dV_1/dt", "accepted by the program"),
             tuple(rows),
         ),
         **said("claims/tracking-gains", fit=max(fits), misfit=min(misfits), eigenvalue=rows[-1][5], printed=rows[0][3]),
@@ -188,7 +188,7 @@ def _yes(answer: bool) -> str:
 
 
 def accepted(Lambda: Array, K_D: Array) -> bool:
-    """Whether the program takes gains."""
+    """Whether `Tracking` accepts the gains."""
     desired = Harmonics([HarmonicsSpec(), HarmonicsSpec()])
     try:
         Tracking(Lambda, K_D, desired)
@@ -200,18 +200,18 @@ def accepted(Lambda: Array, K_D: Array) -> bool:
 # --- section III-C: "the more exact reduced model periodically sees some deviations" -----------------------------
 
 
-def deviations_claim(t: Array, error: Array, found: Mapping[str, Deviation], figures: Path) -> Claim:
-    """Judge deviations from the exact run by setting of `SETTINGS`."""
-    tight, loose, shared, own = ([found[name] for name in group] for group in SETTINGS.values())
+def deviations_claim(t: Array, error: Array, by_setting: Mapping[str, Deviation], figures: Path) -> Claim:
+    """Return the verdict on deviations from the exact run, by setting of `SETTINGS`."""
+    tight, loose, shared, separate = ([by_setting[name] for name in group] for group in SETTINGS.values())
     largest = max(x.largest for x in tight)
-    periodic = [name for name, x in found.items() if _periodic(x)]
+    periodic = [name for name, x in by_setting.items() if _periodic(x)]
     return Claim(
         key="tracking-deviations",
         verdict="does not hold" if largest < EXACT else "holds",
-        figures=(draw_deviations(t, error, {name: found[name] for name in SHOWN}, figures),),
+        figures=(draw_deviations(t, error, {name: by_setting[name] for name in SHOWN}, figures),),
         table=(
             ("run", "largest deviation (rad)", "share that repeats", "strongest period (2π s)", "largest |phi| (m)"),
-            tuple((name, *_deviation_cells(x)) for name, x in found.items()),
+            tuple((name, *_deviation_cells(x)) for name, x in by_setting.items()),
         ),
         **said(
             "claims/tracking-deviations",
@@ -220,9 +220,9 @@ def deviations_claim(t: Array, error: Array, found: Mapping[str, Deviation], fig
             loose_repeats=max(x.repeats for x in loose),
             shared=max(x.largest for x in shared),
             shared_open=max(x.open for x in shared),
-            own=max(x.largest for x in own),
-            own_open=max(x.open for x in own),
-            own_repeats=min(x.repeats for x in own),
+            separate=max(x.largest for x in separate),
+            separate_open=max(x.open for x in separate),
+            separate_repeats=min(x.repeats for x in separate),
             share=PERIODIC,
             periodic=periodic,
         ),

@@ -1,4 +1,4 @@
-"""Experiments on tracking control (eqs. 16 to 19); `scripts.experiments.paper.tracking` turns them into claims."""
+"""Experiments on tracking control (eqs. 16 to 19), which `scripts.experiments.paper.tracking` evaluates."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ EXPLICIT = {"solver.method": "DOP853", "solver.rtol": 1e-12}
 ON_MANIFOLD: dict[str, dict[str, Any]] = {
     "reduced, eq. 6": {"formulation": "reduced", **EXPLICIT},
     "SPF, eq. 17": {"formulation": "spf", **EXPLICIT},
-    # explicit methods are bound to steps of epsilon in eq. 8 as printed
+    # Eq. 8 as printed limits explicit methods to steps of the size of epsilon.
     "SPF, eq. 8": {"formulation": "spf", "spf_coordinates": "z", "solver.method": "Radau", "solver.rtol": 1e-10},
     "DAE, eq. 1": {"formulation": "dae", **EXPLICIT},
 }
-SINCE = 0.1  # s; r dies out with 1/600 s, which output instants up to here resolve
+SINCE = 0.1  # s: start of the records, after r has decayed (time constant 1/600 s)
 START = {"t_end": SINCE, "solver.output_dt": 5e-5}
 WHOLE = {"solver.method": "Radau", "solver.rtol": 1e-9, "solver.output_dt": 0.01}
 PERIODS = 4
 
 
 def lyapunov_along(overrides: Mapping[str, Any], since: float = 0.0, scene: str = SCENE) -> Record:
-    """Run a tracking scene and compare eq. 18's function with the rate that eq. 19's last line gives it.
+    """Run a tracking scene and compare the rate of eq. 18's function with the last line of eq. 19.
 
-    With d_1 = d_2 = 1, M = I and errors' rates where eq. 19 prints rates.
+    Eq. 19 is used with d_1 = d_2 = 1 and M = I, and with the errors' rates in place of the rates.
 
     Parameters
     ----------
     overrides : mapping
-        Values of the scene by dotted key.
+        Overrides of the scene by dotted key.
     since : float
-        Where the record begins, s.
+        Start of the record, s.
     scene : str
 
     Raises
@@ -65,7 +65,7 @@ def lyapunov_along(overrides: Mapping[str, Any], since: float = 0.0, scene: str 
     InputError
         The scene has no tracking controller.
     NumericalError
-        The run does not get to its end.
+        The run stops early.
     """
     loaded = load_scene(scene, overrides)
     controller = _tracking(loaded)
@@ -111,7 +111,7 @@ def off_manifold(epsilon: float, convention: str, moving: bool) -> Record:
 
 
 EXACT = Setting("reduced", "Radau", 1e-9)
-# by what is not exact about them
+# grouped by the source of the error
 SETTINGS: dict[str, dict[str, Setting]] = {
     "nothing": {"SPF, eq. 8: Radau, rtol 1e-9": Setting("eq. 8", "Radau", 1e-9)},
     "integrator": {
@@ -128,8 +128,8 @@ SETTINGS: dict[str, dict[str, Setting]] = {
         "sigma of both to 1e-3 m": Setting("reduced", "Radau", 1e-8, tolerance=1e-3),
     },
     "controller's sigma": {
-        "controller's own sigma to 1e-2 m": Setting("reduced", "RK45", 1e-3, own=1e-2),
-        "controller's own sigma to 1e-3 m": Setting("reduced", "RK45", 1e-3, own=1e-3),
+        "controller's own sigma to 1e-2 m": Setting("reduced", "RK45", 1e-3, controller_tolerance=1e-2),
+        "controller's own sigma to 1e-3 m": Setting("reduced", "RK45", 1e-3, controller_tolerance=1e-3),
     },
 }
 
@@ -147,11 +147,11 @@ def deviations(
         s.
     error : (m,) array
         Largest |q - q_d| of the exact run, rad.
-    found : dict of str to Deviation
+    by_setting : dict of str to Deviation
     """
     times = instants(periods)
     exact = run(SCENE, EXACT, times)
     controller = _tracking(load_scene(SCENE))
     desired = np.array([controller.desired(float(t))[0] for t in times])
-    found = {name: deviation(run(SCENE, setting, times), exact) for name, setting in settings.items()}
-    return times, np.abs(exact.q - desired).max(axis=1), found
+    by_setting = {name: deviation(run(SCENE, setting, times), exact) for name, setting in settings.items()}
+    return times, np.abs(exact.q - desired).max(axis=1), by_setting

@@ -15,11 +15,11 @@ from scripts.experiments.paper.lyapunov import Record
 __all__ = ["draw_deviations", "draw_lyapunov"]
 
 FLOOR = 1e-16  # for zeros on a logarithmic scale
-SHARE = 0.85  # of the distance between two traces that the larger takes
+SHARE = 0.85  # height of a trace over the distance between traces
 
 
 def draw_lyapunov(on: Record, off: Mapping[str, Record], epsilon: float, folder: Path) -> str:
-    """Eq. 18's function and its rate along a run, and the rate in the boundary layer against eq. 19."""
+    """Draw eq. 18's function and its rate along a run, and the rate in the boundary layer against eq. 19."""
     figure, (left, right) = chart(2)
     left.semilogy(on.t, on.value, color=COLOURS[0], label="V of eq. 18 (J)")
     left.semilogy(on.t, np.maximum(-on.rate, FLOOR), color=COLOURS[1], label="$-dV/dt$, differentiated (W)")
@@ -36,14 +36,14 @@ def draw_lyapunov(on: Record, off: Mapping[str, Record], epsilon: float, folder:
 
 
 def draw_deviations(t: Array, error: Array, shown: Mapping[str, Deviation], folder: Path) -> str:
-    """How far runs are from the exact one: on a log scale, and each on its own scale by the period of eq. 21."""
+    """Draw deviations from the exact run on a logarithmic scale, and each one scaled, over the periods of eq. 21."""
     figure, (left, right) = chart(2)
     figure.set_size_inches(12.8, 6.2)
     left.semilogy(t, error, color=BLACK, label="$|q - q_d|$ of the exact run")
     after = t >= SETTLED * PERIOD
-    for row, ((name, found), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
-        left.semilogy(t[1:], np.maximum(found.size[1:], FLOOR), color=colour, linewidth=0.9, label=name)
-        trace = found.size[after] / found.size[after].max()
+    for row, ((name, deviation), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
+        left.semilogy(t[1:], np.maximum(deviation.size[1:], FLOOR), color=colour, linewidth=0.9, label=name)
+        trace = deviation.size[after] / deviation.size[after].max()
         right.fill_between(t[after] / PERIOD, -row, SHARE * trace - row, color=colour, linewidth=0)
     left.set(xlabel="$t$ (s)", ylabel="largest of the angles (rad)", title="deviation from the exact run")
     right.set(xlabel="$t$ (2π s)", title="the same after the first period, each on its own scale", yticks=[])

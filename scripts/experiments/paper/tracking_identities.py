@@ -1,4 +1,4 @@
-"""What eq. 19 rests on: that D_dot - 2 C is skew-symmetric, and the algebra of its gains."""
+"""Check the assumptions of eq. 19: skew-symmetry of D_dot - 2 C, and the algebra of the gains."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from scripts.experiments.certificate.branch_walk import follow, margin
 
 __all__ = ["Skewness", "claimed_form", "defect", "printed_form", "rate_form", "skewness"]
 
-TRIES = 50  # for each state
-STEP = 1e-4  # rad or m along a velocity of unit size, of the differences that give D_dot
-LEAST = 0.3  # of the assembled |s|: nearer to singular ones differences lose their digits
+TRIES = 50  # attempts per state
+STEP = 1e-4  # rad or m along a unit velocity: step of the differences for D_dot
+MIN_RELATIVE_MARGIN = 0.3  # smallest |s| over the assembled |s|; differences are inaccurate near singular ones
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class Skewness:
     Attributes
     ----------
     on : float
-        On phi = 0, where both conventions agree.
+        On phi = 0, where both conventions are equal.
     off_rho_rho : float
-        Off it, D_dot along rho q_dot (on the level set) and C at rho q_dot.
+        Off the manifold, D_dot along rho q_dot (on the level set) and C at rho q_dot.
     off_actual_rho : float
-        Off it, D_dot along the SPF's actual velocity, C at rho q_dot (eq. 8).
+        Off the manifold, D_dot along the SPF's actual velocity and C at rho q_dot (eq. 8).
     off_actual_actual : float
-        Off it, D_dot along the actual velocity and C at it (eq. 16).
+        Off the manifold, D_dot and C both at the actual velocity (eq. 16).
     states : int
-        How many were far enough from singular.
+        Number of states far enough from singular configurations.
     """
 
     on: float
@@ -46,21 +46,21 @@ class Skewness:
 
 
 def skewness(mechanism: Mechanism, count: int, epsilon: float, off: float = 0.02, seed: int = 0) -> Skewness:
-    """Measure the skew-symmetry of D_dot - 2 C, D_dot by differences of D, at random states.
+    """Measure the skew-symmetry of D_dot - 2 C at random states, with D_dot by differences of D.
 
     Parameters
     ----------
     mechanism : Mechanism
     count : int
-        States.
+        Number of states.
     epsilon : float
-        Of the SPF whose flow is meant.
+        Epsilon of the SPF.
     off : float
-        How far z is moved off the closure, rad or m.
+        Displacement of z off the constraint manifold, rad or m.
     seed : int
     """
     random = np.random.default_rng(seed)
-    worst, states, least = np.zeros(4), 0, LEAST * margin(mechanism.assembled)
+    worst, states, smallest = np.zeros(4), 0, MIN_RELATIVE_MARGIN * margin(mechanism.assembled)
     for _ in range(TRIES * count):
         if states == count:
             break
@@ -68,7 +68,7 @@ def skewness(mechanism: Mechanism, count: int, epsilon: float, off: float = 0.02
         away = np.zeros(mechanism.n)
         away[at.partition.z] = random.uniform(-off, off, mechanism.n - mechanism.d)
         moved = at.integrate(away)
-        if min(margin(at), margin(moved)) < least:
+        if min(margin(at), margin(moved)) < smallest:
             continue
         states += 1
         q_dot = random.uniform(-2, 2, mechanism.d)
@@ -93,7 +93,7 @@ def defect(mechanism: Mechanism, at: Kinematics, along: Array, at_velocity: Arra
 
 
 def rate_form(Lambda: Array, K_D: Array) -> Array:
-    """The symmetric (2 d, 2 d) matrix of -dV_1/dt over (q_tilde, q_tilde_dot) along eq. 17.
+    """Return the symmetric (2 d, 2 d) matrix of -dV_1/dt in (q_tilde, q_tilde_dot) along eq. 17.
 
     With D_dot - 2 C skew and d_1 = 1, dV_1/dt = -r^T K_D r + q_tilde_dot^T (A + A^T) q_tilde with A = Lambda^T K_D.
     """
@@ -103,19 +103,19 @@ def rate_form(Lambda: Array, K_D: Array) -> Array:
 
 
 def claimed_form(Lambda: Array, K_D: Array) -> Array:
-    """The same of eq. 19's last line, q_tilde_dot^T K_D q_tilde_dot + q_tilde^T Lambda^T K_D Lambda q_tilde."""
+    """Return the form of eq. 19's last line, q_tilde_dot^T K_D q_tilde_dot + q_tilde^T Lambda^T K_D Lambda q_tilde."""
     zero = np.zeros_like(K_D)
     return _symmetric(np.block([[Lambda.T @ K_D @ Lambda, zero], [zero, K_D]]))
 
 
 def printed_form(Lambda: Array, K_D: Array) -> Array:
-    """The same of eq. 19's first line as printed, with -2 q_tilde_dot^T Lambda K_D q_tilde."""
+    """Return the matrix of eq. 19's first line as printed, with -2 q_tilde_dot^T Lambda K_D q_tilde."""
     r = np.hstack([Lambda, np.eye(len(K_D))])
     return _symmetric(r.T @ K_D @ r + _cross(2 * Lambda @ K_D))
 
 
 def _cross(X: Array) -> Array:
-    """The matrix of the form q_tilde_dot^T X q_tilde."""
+    """Return the matrix of the form q_tilde_dot^T X q_tilde."""
     zero = np.zeros_like(X)
     return np.block([[zero, zero], [X, zero]])
 

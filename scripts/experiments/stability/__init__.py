@@ -1,1 +1,1 @@
-"""The stability suite: cases x formulations x methods, each cell measured against a reference of its own."""
+"""Stability suite: cases, formulations and methods, each run compared with an independent reference."""

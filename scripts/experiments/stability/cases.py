@@ -1,7 +1,8 @@
-"""The cases: extremes of epsilon, masses, lengths, gains, speeds, springs, nearness to singular, and published ones.
+"""Cases of the suite: extremes of epsilon, masses, lengths, gains, speeds and springs; near-singular, published.
 
-Ends are chosen so that the motion's own conditioning permits a comparison: two references, from starts 1e-10 apart or
-from two solvers, agree far within what is allowed. A five-bar that tumbles is chaotic, so fast ones turn a few times.
+The end times are chosen so that the conditioning of the motion permits a comparison: two references, from starts that
+differ by 1e-10 or from two solvers, agree far within the allowed error. A tumbling five-bar is chaotic, so fast ones
+make a few turns only.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from typing import Any
 from scripts.experiments.stability.cell import Case, How
 from scripts.experiments.stability.equations import set_point, tracking
 from scripts.experiments.stability.planar import JointSpring, LineSpring, Planar
-from scripts.experiments.stability.reference import ByHand, Known, OneAngle, Returns
+from scripts.experiments.stability.reference import ByHand, OneAngle, PublishedValues, Returns
 
 __all__ = ["GROUPS"]
 
 PAPER = Planar()
 EQUILIBRIUM = (-1.4343085080901642, -1.7073321688743597)  # theta_1, theta_3 of the hanging five-bar
 SWING = (EQUILIBRIUM[0] + 0.5, EQUILIBRIUM[1] + 0.5)
-TYPE_1 = acos(PAPER.base / 2 / PAPER.l[0])  # of theta_1 where both elbows coincide; theta_3 is pi less it
-EVERY = (How("reduced"), How("spf"), How("dae"))
+TYPE_1 = acos(PAPER.base / 2 / PAPER.l[0])  # rad: theta_1 at which both elbows coincide, with theta_3 = pi - theta_1
+MODELS = (How("reduced"), How("spf"), How("dae"))
 OUTPUTS = 20
 
 
@@ -35,7 +36,7 @@ def _scene(q: tuple[float, float], t_end: float, q_dot: tuple[float, float] = (0
 
 
 def methods() -> Iterator[Case]:
-    """The swing, by every method at three tolerances."""
+    """Yield the swing by every method at three tolerances."""
     for rtol in (1e-5, 1e-8, 1e-11):
         how = [How(f, m, rtol) for f in ("reduced", "dae") for m in ("auto", "DOP853", "RK45", "Radau")]
         how += [How("spf", m, rtol, printed=True) for m in ("DOP853", "RK45", "Radau")]
@@ -44,7 +45,7 @@ def methods() -> Iterator[Case]:
 
 
 def epsilons() -> Iterator[Case]:
-    """Epsilon from 1e-1 to 1e-12, on the manifold, off it, and as far off as the mechanism bears, moving."""
+    """Yield epsilons from 1e-1 to 1e-12: on the manifold, off it, and moving with the largest possible w."""
     q_dot = (1.0, -2.0)
     far = 0.9 * (PAPER.l[1] + PAPER.l[3] - _elbows(PAPER, SWING))
     levels = {"w(0) = 0": (0.0, 0.0), "w(0) = (0.01, -0.006)": (0.01, -0.006), "w(0) large": (-far, 0.0)}
@@ -52,7 +53,7 @@ def epsilons() -> Iterator[Case]:
         epsilon = 10.0**exponent
         for name, w in levels.items():
             how = [How("spf"), How("spf", "Radau", printed=True)]
-            if epsilon >= 1e-3:  # explicit methods are bound to steps of epsilon
+            if epsilon >= 1e-3:  # explicit methods need steps of the size of epsilon
                 how += [How("spf", m, printed=True) for m in ("RK45", "DOP853")]
             scene = {**_scene(SWING, 1.0, q_dot), "epsilon": epsilon}
             if any(w):
@@ -66,36 +67,36 @@ def _elbows(p: Planar, q: tuple[float, float]) -> float:
 
 
 def masses() -> Iterator[Case]:
-    """One link, or one chain, lighter or heavier than the others by up to 1e8."""
+    """Yield masses of one link or one chain that differ from the others by factors up to 1e8."""
     for exponent in (-8, -6, -4, -2, 2, 4, 6, 8):
         r = 10.0**exponent
         for name, factors in (("link 2", (1.0, r, 1.0, 1.0)), ("left chain", (r, r, 1.0, 1.0))):
             p = PAPER.heavier(factors)
-            yield Case("mass", f"{name} x {r:.0e}", p, _scene(SWING, 1.0), ByHand(p), EVERY)
+            yield Case("mass", f"{name} x {r:.0e}", p, _scene(SWING, 1.0), ByHand(p), MODELS)
 
 
 def lengths() -> Iterator[Case]:
-    """All lengths scaled; time goes as their square root."""
+    """Yield scaled lengths; times scale with the square root of lengths."""
     for exponent in range(-3, 4):
         s = 10.0**exponent
         p = PAPER.longer(s / PAPER.base)
-        yield Case("length", f"base {s:g} m", p, _scene(SWING, 2.0 * sqrt(s)), ByHand(p), EVERY)
+        yield Case("length", f"base {s:g} m", p, _scene(SWING, 2.0 * sqrt(s)), ByHand(p), MODELS)
 
 
 def gains() -> Iterator[Case]:
-    """Set points and tracking with gains from 1e-3 to 1e6; no damping at all."""
+    """Yield set points and tracking with gains from 1e-3 to 1e6, also without damping."""
     raised = (pi / 4, pi / 4)
-    # what is let go by low gains leaves the chart of q in the end, so the target is near
-    near = (EQUILIBRIUM[0] + 0.3, EQUILIBRIUM[1] + 0.2)
+    # With low gains a mechanism that starts far from its target leaves the chart of q, so the target is near.
+    near_target = (EQUILIBRIUM[0] + 0.3, EQUILIBRIUM[1] + 0.2)
     pairs = [(10.0**k, 10.0**k) for k in range(-3, 7)] + [(k, 0.0) for k in (10.0, 1e2, 1e4, 1e6)]
     for K_P, K_V in pairs:
-        target = raised if K_P >= 10 and K_V else near
+        target = raised if K_P >= 10 and K_V else near_target
         t_end = 2.0 if K_V else 10.0 / sqrt(K_P / 0.02)
         scene = _scene(EQUILIBRIUM, t_end)
         q_d = {"theta_1": target[0], "theta_3": target[1]}
         scene["controller"] = {"type": "set_point", "K_P": K_P, "K_V": K_V, "q_d": q_d}
         reference = ByHand(PAPER, set_point(PAPER, target, K_P, K_V))
-        yield Case("gain", f"set point, K_P = {K_P:g}, K_V = {K_V:g}", "five_bar", scene, reference, EVERY, False)
+        yield Case("gain", f"set point, K_P = {K_P:g}, K_V = {K_V:g}", "five_bar", scene, reference, MODELS, False)
     for exponent in range(-3, 7):
         K_D = 10.0**exponent
         scene = _scene(EQUILIBRIUM, 3.0)
@@ -103,7 +104,7 @@ def gains() -> Iterator[Case]:
         stiff = (How("reduced", "Radau"), How("spf", "Radau", printed=True)) if exponent >= 2 else ()
         scene["epsilon"] = 1e-4
         reference = ByHand(PAPER, tracking(1.0, K_D))
-        yield Case("gain", f"tracking, K_D = {K_D:g}", "five_bar", scene, reference, (*EVERY, *stiff), False)
+        yield Case("gain", f"tracking, K_D = {K_D:g}", "five_bar", scene, reference, (*MODELS, *stiff), False)
 
 
 _EQ_21 = {
@@ -113,7 +114,7 @@ _EQ_21 = {
 
 
 def near_singular() -> Iterator[Case]:
-    """Starts from rest near coincident elbows (type 1, above and below) and near stretched distal links (type 2)."""
+    """Yield starts at rest near coincident elbows (type 1, above and below) and near aligned distal links (type 2)."""
     stretched = _stretched(PAPER, -2.0)
     for exponent in range(-1, -13, -1):
         delta = 10.0**exponent
@@ -122,11 +123,11 @@ def near_singular() -> Iterator[Case]:
             ("type 1 below", (-TYPE_1 - delta, TYPE_1 - pi)),
             ("type 2", (-2.0, stretched - delta)),
         ):
-            yield Case("singular", f"{name}, {delta:.0e} away", "five_bar", _scene(q, 0.5), ByHand(PAPER), EVERY)
+            yield Case("singular", f"{name}, {delta:.0e} away", "five_bar", _scene(q, 0.5), ByHand(PAPER), MODELS)
 
 
 def _stretched(p: Planar, theta_1: float) -> float:
-    """The larger theta_3 in (-pi, 0) where the distal links are in line."""
+    """Return the larger theta_3 in (-pi, 0) at which the distal links are aligned."""
     low, high = theta_1, 0.0
     for _ in range(200):
         middle = (low + high) / 2
@@ -135,32 +136,32 @@ def _stretched(p: Planar, theta_1: float) -> float:
 
 
 def speeds() -> Iterator[Case]:
-    """Thrown at up to 1e3 rad/s, and swings that cross type 2."""
+    """Yield initial rates up to 1e3 rad/s, and swings that cross type 2."""
     for exponent in range(4):
         rate = 10.0**exponent
         for name, ratio in (("together", 1.0), ("apart", -0.3)):
             scene = _scene(EQUILIBRIUM, min(1.0, 5.0 / rate), (rate, ratio * rate))
-            yield Case("speed", f"{rate:g} rad/s, {name}", "five_bar", scene, ByHand(PAPER), EVERY)
+            yield Case("speed", f"{rate:g} rad/s, {name}", "five_bar", scene, ByHand(PAPER), MODELS)
     for rate in (6.0, 9.0, 12.0):
-        scene = _scene(EQUILIBRIUM, 0.5, (rate, -rate))  # in two seconds errors grow ten thousand times
-        yield Case("speed", f"crossing type 2, {rate:g} rad/s", "five_bar", scene, ByHand(PAPER), EVERY)
+        scene = _scene(EQUILIBRIUM, 0.5, (rate, -rate))  # errors grow by 1e4 in two seconds
+        yield Case("speed", f"crossing type 2, {rate:g} rad/s", "five_bar", scene, ByHand(PAPER), MODELS)
 
 
 def springs() -> Iterator[Case]:
-    """A spring on the tip or on a joint, to 1e9 N/m, free or overdamped; free ones for sixty radians of theirs."""
+    """Yield springs on the tip or a joint up to 1e9 N/m, undamped (for 60 rad of oscillation) or overdamped."""
     for exponent in range(0, 10):
         k = 10.0**exponent
         line = LineSpring(k, 0.0, 0.5, 0.1, 0.1)
         t_end = min(1.0, 60.0 / sqrt(k / 0.1))
         p = Planar(line=line)
-        yield Case("spring", f"line {k:.0e} N/m", p, _scene(SWING, t_end), ByHand(p), EVERY)
+        yield Case("spring", f"line {k:.0e} N/m", p, _scene(SWING, t_end), ByHand(p), MODELS)
         damped = Planar(line=LineSpring(k, 2.0 * sqrt(k), 0.5, 0.1, 0.1))
         reference = ByHand(damped, stiff=True)
         scene = _scene(SWING, min(1.0, 10 * t_end))
-        yield Case("spring", f"line {k:.0e} N/m, damped", damped, scene, reference, EVERY, False)
+        yield Case("spring", f"line {k:.0e} N/m, damped", damped, scene, reference, MODELS, False)
     for k in (1e3, 1e6, 1e9):
         p = Planar(joint=JointSpring(k, 0.0, SWING[0] + 1e-3))
-        yield Case("spring", f"joint {k:.0e} N m/rad", p, _scene(SWING, 60.0 / sqrt(k / 0.02)), ByHand(p), EVERY)
+        yield Case("spring", f"joint {k:.0e} N m/rad", p, _scene(SWING, 60.0 / sqrt(k / 0.02)), ByHand(p), MODELS)
 
 
 ANDREWS_START = {
@@ -186,30 +187,30 @@ BRICARD_PERIOD = 4.99171151369
 
 
 def published() -> Iterator[Case]:
-    """Andrews' squeezer, Bricard's mechanism, N-four-bars."""
+    """Yield Andrews' squeezer, Bricard's mechanism and N-four-bars."""
     andrews = {"initial.q": ANDREWS_START, "t_end": 0.03, "solver.output_dt": 0.03}
     source = "published values (Hairer and Wanner), thirteen digits"
     implicit = How("dae", "Radau"), How("reduced", "Radau")
     tolerances = How("reduced", rtol=1e-10), How("dae", rtol=1e-5), How("dae", rtol=1e-11)
-    ways: tuple[How, ...] = (*EVERY, *implicit, How("dae", "RK45"), *tolerances)
-    yield Case("published", "Andrews", "andrews", andrews, Known(source, 1e-12, ANDREWS), ways)
+    ways: tuple[How, ...] = (*MODELS, *implicit, How("dae", "RK45"), *tolerances)
+    yield Case("published", "Andrews", "andrews", andrews, PublishedValues(source, 1e-12, ANDREWS), ways)
     bricard = {"initial.at": "assembled", "solver.output_dt": 0.05}
-    known = Known("published position, eight digits", 1e-8, points={"P3": BRICARD_P3})
-    yield Case("published", "Bricard at 1 s", "bricard", {**bricard, "t_end": 1.0}, known, (*EVERY, *implicit))
-    whole = {**bricard, "t_end": BRICARD_PERIOD, "solver.output_dt": BRICARD_PERIOD}
+    position = PublishedValues("published position, eight digits", 1e-8, points={"P3": BRICARD_P3})
+    yield Case("published", "Bricard at 1 s", "bricard", {**bricard, "t_end": 1.0}, position, (*MODELS, *implicit))
+    period = {**bricard, "t_end": BRICARD_PERIOD, "solver.output_dt": BRICARD_PERIOD}
     back = Returns("published period: back at the start, at rest", 1e-10)
-    yield Case("published", "Bricard, one period", "bricard", whole, back, EVERY)
+    yield Case("published", "Bricard, one period", "bricard", period, back, MODELS)
     for N in (1, 2, 7, 40):
         k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
         row = {"initial.q": {"theta_0": pi / 2}, "initial.q_dot": {"theta_0": -1.0}}
-        made = {"generator": "n_four_bar", "N": N}
+        generated = {"generator": "n_four_bar", "N": N}
         short = {**row, "t_end": 0.6, "solver.output_dt": 0.05}
-        yield Case("published", f"N-four-bar, N = {N}, 0.6 s", made, short, OneAngle(k), EVERY)
+        yield Case("published", f"N-four-bar, N = {N}, 0.6 s", generated, short, OneAngle(k), MODELS)
         if N == 40:
             continue
         through = {**row, "t_end": 3.0 if N > 2 else 10.0, "solver.output_dt": 0.25}
         ways = tuple(How("dae", rtol=rtol) for rtol in (1e-6, 1e-8, 1e-10))
-        yield Case("published", f"N-four-bar, N = {N}, through rank losses", made, through, OneAngle(k), ways)
+        yield Case("published", f"N-four-bar, N = {N}, through rank losses", generated, through, OneAngle(k), ways)
 
 
 GROUPS = {

@@ -1,4 +1,4 @@
-"""One cell of the table: run a case in one formulation by one method, measure it, judge it."""
+"""Run a case in one formulation by one method, and give a verdict on its error: a cell of the table."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["ALLOWED", "BUDGET", "Case", "Cell", "How", "Verdict", "kinetic_energ
 Verdict = Literal["within", "stopped", "FAILED"]
 
 NAN = float("nan")
-ALLOWED = 1e3  # times rtol, relative to the solution's scale
+ALLOWED = 1e3  # largest error over rtol, relative to the solution's scale
 BUDGET = {"solver.max_rhs": 30_000, "solver.max_wall_s": 300.0}
 
 
 @dataclass(frozen=True)
 class How:
-    """A formulation and a method; the SPF in the coordinates of eq. 17, or as eq. 8 is printed."""
+    """A formulation and a method, with the SPF in the coordinates of eq. 17 or as eq. 8 is printed."""
 
     formulation: str
     method: str = "auto"
@@ -40,7 +40,7 @@ class How:
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """As a scene's keys."""
+        """Return the overrides of a scene."""
         return {
             "formulation": self.formulation,
             "spf_coordinates": "z" if self.printed else "w",
@@ -50,21 +50,21 @@ class How:
 
     @property
     def label(self) -> str:
-        """Such as "spf (8)"."""
+        """Short name, for example "spf (8)"."""
         return f"{self.formulation} (8)" if self.printed else self.formulation
 
 
 @dataclass(frozen=True)
 class Case:
-    """A motion to be run, and what is right.
+    """A motion to run, and its reference.
 
     Attributes
     ----------
     group, name : str
     mechanism : Planar, str or table
-        Written into a folder for the run, shipped, or made by rule.
+        Five-bar to write as files, name of a shipped mechanism, or table of a generator.
     overrides : mapping
-        The rest of the scene, by dotted key.
+        Other values of the scene, by dotted key.
     reference : Reference
     how : tuple of How
     conserves : bool
@@ -82,21 +82,21 @@ class Case:
 
 @dataclass(frozen=True)
 class Cell:
-    """A row of the table.
+    """Result of one run: a row of the table.
 
     Attributes
     ----------
     error : float
-        Largest error over the output instants up to where the run ended, relative to the solution's scale.
+        Largest error over the output instants to the end of the run, relative to the solution's scale.
     allowed : float
     max_phi : float
         Largest |phi - w| at the output instants, m.
     uncertainty : float
-        Of the reference, as relative.
+        Relative error bound of the reference.
     drift : float
-        Of the energy, relative to the largest kinetic energy; NaN where energy is not conserved.
+        Drift of the energy, relative to the largest kinetic energy; NaN if energy is not conserved.
     cpu_s : float
-        Of processor time.
+        Processor time, s.
     """
 
     group: str
@@ -121,7 +121,7 @@ class Cell:
 
 
 def run_case(case: Case) -> list[Cell]:
-    """Run a case in all its ways; one reference serves them all."""
+    """Run a case in all its formulations and methods, which share one reference."""
     with tempfile.TemporaryDirectory() as folder:
         mechanism: Any = case.mechanism
         if isinstance(mechanism, Planar):
@@ -139,7 +139,7 @@ def _run_cell(case: Case, how: How, data: dict[str, Any], folder: Path) -> Cell:
         run = simulate(make_scene(data, f"{case.group}: {case.name}", Sources(case.name, folder)))
     except NumericalError as refused:  # a singular start
         return Cell(**key, verdict="stopped", cpu_s=process_time() - started, message=str(refused))
-    except Exception as crash:  # anything but a verdict of the program is a fault of it
+    except Exception as crash:  # any other exception is a failure
         return Cell(**key, verdict="FAILED", cpu_s=process_time() - started, message=f"{type(crash).__name__}: {crash}")
     spent = process_time() - started
     allowed = ALLOWED * how.rtol

@@ -1,13 +1,13 @@
-"""The five-bar's motion written down by hand, in the links' absolute angles: the suite's reference for it.
+"""Equations of motion of the five-bar, derived by hand in the links' absolute angles, as the suite's reference.
 
-Nothing here uses the package's terms. a = (theta_1, theta_1 + theta_2, theta_3, theta_3 + theta_4) are the angles of
-the links from +x, r their rates. A chain of links 1, 2 with pins at its ends has
+This module does not use the package's terms. a = (theta_1, theta_1 + theta_2, theta_3, theta_3 + theta_4) are the
+angles of the links from +x, r their rates. A chain of links 1, 2 with pins at its ends has
 
     (I1 + m1 c1^2 + m2 l1^2) a1'' + B cos(a2 - a1) a2'' - B sin(a2 - a1) r2^2 + g (m1 c1 + m2 l1) cos a1 = f1
     (I2 + m2 c2^2) a2'' + B cos(a2 - a1) a1'' + B sin(a2 - a1) r1^2 + g m2 c2 cos a2 = f2,       B = m2 l1 c2
 
-and the loop closes where the sum of s_i l_i (cos a_i, sin a_i) is (base, 0), s = (1, 1, -1, -1). Scalars, not arrays:
-a right-hand side takes microseconds.
+and the loop closes if the sum of s_i l_i (cos a_i, sin a_i) is (base, 0), s = (1, 1, -1, -1). Scalars instead of arrays
+keep a right-hand side at a few microseconds.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
 def to_absolute(theta: Numbers) -> list[float]:
-    """Return the links' angles (or rates) of the joints'."""
+    """Convert joint angles or rates to the links' absolute angles or rates."""
     return [theta[0], theta[0] + theta[1], theta[2], theta[2] + theta[3]]
 
 
 @dataclass(frozen=True)
 class Tree:
-    """The two chains' mass matrix (two blocks) and the forces on a at a state: M a'' = f + J^T lambda."""
+    """Mass matrix of the two chains (two blocks) and forces on a at a state: M a'' = f + J^T lambda."""
 
     m11: float
     m12: float
@@ -68,7 +68,7 @@ def _solve(D: tuple[float, float, float], f: Numbers) -> Pair:
 
 
 def tree(p: Planar, a: Numbers, r: Numbers, rates: bool = True) -> Tree:
-    """Evaluate the equations above; without `rates` no velocity acts."""
+    """Evaluate the equations above; without `rates` all velocities are zero."""
     blocks, f = [], []
     for i, j in ((0, 1), (2, 3)):
         bend = a[j] - a[i]
@@ -107,7 +107,7 @@ def _pull(p: Planar, a: Numbers, r: Numbers, f: list[float]) -> None:
 
 
 def miss(p: Planar, a: Numbers) -> Pair:
-    """Left tip minus right tip, m."""
+    """Return the left tip minus the right tip, m."""
     x = sum(s * l * cos(k) for s, l, k in zip(SIGN, p.l, a, strict=True)) - p.base
     return x, sum(s * l * sin(k) for s, l, k in zip(SIGN, p.l, a, strict=True))
 
@@ -127,10 +127,11 @@ def _bend(p: Planar, a: Numbers, r: Numbers) -> Pair:
 
 
 def free_motion(p: Planar) -> Callable[[float, Numbers], list[float]]:
-    """Return y' of y = (a, r), the free motion on the plane that the loop leaves of the links' rates.
+    """Return the function y' of y = (a, r) for the free motion of the closed loop.
 
-    The plane's coordinates are the two rates that leave the best determinant to the other two, so that no
-    singularity of theta_1 and theta_3 matters; multipliers, which would cancel where masses differ much, are not used.
+    Admissible rates form a plane. Its coordinates are the two rates whose complement has the best determinant, so that
+    singularities of the chart (theta_1, theta_3) have no influence. Multipliers are not used: they would cancel if
+    masses differ much.
     """
 
     def rate(t: float, y: Numbers) -> list[float]:
@@ -141,7 +142,7 @@ def free_motion(p: Planar) -> Callable[[float, Numbers], list[float]]:
         det = _cross(J[i], J[j])
 
         def close(x: float, y: float) -> list[float]:
-            """Return the rates with J r = -(x, y) of links i and j alone."""
+            """Return the rates of links i and j with J r = -(x, y)."""
             r = [0.0] * 4
             r[i], r[j] = -(J[j][1] * x - J[j][0] * y) / det, -(J[i][0] * y - J[i][1] * x) / det
             return r
@@ -163,7 +164,7 @@ def free_motion(p: Planar) -> Callable[[float, Numbers], list[float]]:
 
 
 class Reduced:
-    """Eq. 6 at q = (a1, a3), q_dot on the level set phi = w, the distal links found as two circles' intersection.
+    """Terms of eq. 6 at q = (a1, a3) on the level set phi = w, with the distal links from the intersection of circles.
 
     Attributes
     ----------
@@ -178,17 +179,17 @@ class Reduced:
         right = (p.base + p.l[2] * cos(q[1]), p.l[2] * sin(q[1]))
         dx, dy = right[0] - left[0], right[1] - left[1]
         d2 = dx * dx + dy * dy
-        along = (d2 + p.l[1] ** 2 - p.l[3] ** 2) / (2 * d2)
-        across = branch * sqrt(p.l[1] ** 2 / d2 - along**2)
-        x, y = left[0] + along * dx + across * dy, left[1] + along * dy - across * dx
+        times_rho = (d2 + p.l[1] ** 2 - p.l[3] ** 2) / (2 * d2)
+        across = branch * sqrt(p.l[1] ** 2 / d2 - times_rho**2)
+        x, y = left[0] + times_rho * dx + across * dy, left[1] + times_rho * dy - across * dx
         self.a = [q[0], atan2(y - left[1], x - left[0]), q[1], atan2(y - right[1], x - right[0])]
         self.J = columns(p, self.a)
         self.det = _cross(self.J[1], self.J[3])
-        self.rho_1 = self._z(-self.J[0][0], -self.J[0][1])  # what theta_1's rate does to a2 and a4
+        self.rho_1 = self._z(-self.J[0][0], -self.J[0][1])  # columns of rho: rates of a2 and a4 by that of theta_1
         self.rho_3 = self._z(-self.J[2][0], -self.J[2][1])
-        self.r = self.along(q_dot)
+        self.r = self.times_rho(q_dot)
         self.tree = tree(p, self.a, self.r)
-        one, three = self.along((1.0, 0.0)), self.along((0.0, 1.0))
+        one, three = self.times_rho((1.0, 0.0)), self.times_rho((0.0, 1.0))
         heavy = self.tree.momentum(one), self.tree.momentum(three)
         self.D = (_dot(one, heavy[0]), _dot(one, heavy[1]), _dot(three, heavy[1]))
 
@@ -196,7 +197,7 @@ class Reduced:
         j2, j4 = self.J[1], self.J[3]
         return (j4[1] * x - j4[0] * y) / self.det, (j2[0] * y - j2[1] * x) / self.det
 
-    def along(self, v: Numbers) -> list[float]:
+    def times_rho(self, v: Numbers) -> list[float]:
         """Return rho v."""
         return [
             v[0],
@@ -228,7 +229,7 @@ class Reduced:
 
     def C(self, v: Numbers) -> Pair:
         """Return C v, C from Christoffel symbols at the velocity rho q_dot."""
-        s = self.along(v)
+        s = self.times_rho(v)
         turning = [-k * l * x * y for k, l, x, y in zip(SIGN, self.p.l, self.r, s, strict=True)]
         z = self._z(
             -sum(x * cos(k) for x, k in zip(turning, self.a, strict=True)),
@@ -252,7 +253,7 @@ def uncontrolled(t: float, now: Reduced, q: Numbers, q_dot: Numbers) -> Pair:
 
 
 def set_point(p: Planar, q_d: Pair, K_P: float, K_V: float) -> Control:
-    """Eq. 14 with scalar gains."""
+    """Return q'' under eq. 14 with scalar gains."""
     h_d = Reduced(p, q_d, (0.0, 0.0)).h()
 
     def q_ddot(t: float, now: Reduced, q: Numbers, q_dot: Numbers) -> Pair:
@@ -264,7 +265,7 @@ def set_point(p: Planar, q_d: Pair, K_P: float, K_V: float) -> Control:
 
 
 def tracking(Lambda: float, K_D: float) -> Control:
-    """Eq. 16 on eq. 21: with s = e_dot + Lambda e, D (q'' - a) + C s + K_D s = 0."""
+    """Return q'' under eq. 16 on eq. 21: with s = e_dot + Lambda e, D (q'' - a) + C s + K_D s = 0."""
 
     def q_ddot(t: float, now: Reduced, q: Numbers, q_dot: Numbers) -> Pair:
         q_d, q_d_dot, q_d_ddot = eq_21(t)
@@ -279,6 +280,6 @@ def tracking(Lambda: float, K_D: float) -> Control:
 
 
 def eq_21(t: float) -> tuple[Pair, Pair, Pair]:
-    """q_d and its first two derivatives."""
+    """Return q_d of eq. 21 and its first two derivatives."""
     a, b = pi / 3, pi / 4
     return (a * sin(t), b * (1 - cos(t))), (a * cos(t), b * sin(t)), (-a * sin(t), b * cos(t))

@@ -1,4 +1,4 @@
-"""A thousand seconds: how far the energy drifts, and whether the loops stay closed."""
+"""Runs of 1,000 s: drift of the energy and of phi."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ckc_pin.base.arrays import Array
 from scripts.experiments.stability.cell import kinetic_energies
 from scripts.experiments.stability.equations import to_absolute
 
-__all__ = ["LONG", "LongRun", "long_run"]
+__all__ = ["LONG_RUN_SETTINGS", "LongRun", "long_run"]
 
 RTOL = 1e-10
 T_END = 1000.0
 OUTPUT_DT = 0.1
 # name, formulation, overrides of five_bar/swing
-LONG: tuple[tuple[str, str, dict[str, Any]], ...] = (
+LONG_RUN_SETTINGS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("swing", "reduced", {}),
     ("swing", "spf", {}),
     ("swing", "dae", {}),
@@ -28,7 +28,7 @@ LONG: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 @dataclass(frozen=True)
 class LongRun:
-    """One run.
+    """Result of a long run.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class LongRun:
     max_phi : float
         Largest |phi| at the output instants, m.
     crossings : int
-        How often the sign of det phi_z changed from one output instant to the next.
+        Number of sign changes of det phi_z between output instants.
     """
 
     name: str
@@ -54,9 +54,9 @@ class LongRun:
 
 
 def long_run(name: str, formulation: str, overrides: dict[str, Any], t_end: float = T_END) -> LongRun:
-    """Run one of `LONG`, or a shorter part of it."""
-    every = {"t_end": t_end, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT, "formulation": formulation}
-    run = simulate("five_bar/swing", {**every, **overrides})
+    """Run one of `LONG_RUN_SETTINGS`, or a shorter part of it."""
+    solver = {"t_end": t_end, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT, "formulation": formulation}
+    run = simulate("five_bar/swing", {**solver, **overrides})
     kinetic = kinetic_energies(run)
     drift = np.abs(run.energy - run.energy[0]).max() / (kinetic.max() - kinetic.min())
     return LongRun(
@@ -75,7 +75,7 @@ def long_run(name: str, formulation: str, overrides: dict[str, Any], t_end: floa
 
 
 def _crossings(q_tree: Array) -> int:
-    """Count changes of the side of the line through the distal links, which det phi_z has the sign of."""
+    """Count sign changes of det phi_z, by the sine of the angle between the distal links."""
     angles = np.array([to_absolute(q) for q in q_tree.tolist()])
     side = np.sign(np.sin(angles[:, 1] - angles[:, 3]))
     return int(np.sum(side[1:] != side[:-1]))

@@ -1,4 +1,4 @@
-"""The suite's results as a page and as a table of all cells."""
+"""Write the suite's results as a page and as a table of all cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scripts.experiments.stability.long_runs import LongRun
 __all__ = ["TITLES", "as_frame", "page", "satisfied", "save"]
 
 USUAL_RTOL = 1e-8
-LEAST_WITHIN = 0.9
+REQUIRED_SHARE = 0.9  # smallest share of cells within tolerance
 
 TITLES = {
     "method": "Every method on the swing",
@@ -32,28 +32,28 @@ TITLES = {
 
 
 def as_frame(cells: Sequence[Cell]) -> pd.DataFrame:
-    """Return a row a cell."""
+    """Return a table with one row per cell."""
     return pd.DataFrame(map(asdict, cells), columns=[field.name for field in fields(Cell)])
 
 
 def satisfied(cells: pd.DataFrame) -> bool:
-    """Whether nothing FAILED and nine in ten are within tolerance."""
-    return not (cells.verdict == "FAILED").any() and (cells.verdict == "within").mean() >= LEAST_WITHIN
+    """Whether no cell FAILED and nine in ten are within tolerance."""
+    return not (cells.verdict == "FAILED").any() and (cells.verdict == "within").mean() >= REQUIRED_SHARE
 
 
 def save(cells: pd.DataFrame, path: Path) -> None:
-    """Write all that was measured but for times."""
+    """Write all measurements except times."""
     table = cells.drop(columns="cpu_s")
     table.to_csv(path, index=False, float_format="%.3g", lineterminator="\n", compression=GZIP)
 
 
 def page(cells: pd.DataFrame, long_runs: Sequence[LongRun]) -> str:
-    """Return docs/stability.md.
+    """Return the text of docs/stability.md.
 
     Parameters
     ----------
     cells : DataFrame
-        Of `as_frame`; groups together, in the order of `TITLES`.
+        Result of `as_frame`, sorted by group in the order of `TITLES`.
     long_runs : sequence of LongRun
     """
     rows = list(cells.itertuples())
@@ -64,7 +64,7 @@ def page(cells: pd.DataFrame, long_runs: Sequence[LongRun]) -> str:
         cells=cells,
         summary=_summary(cells),
         groups=groups,
-        tables={group: _table(own) for group, own in groups.items()},
+        tables={group: _table(of_group) for group, of_group in groups.items()},
         titles=TITLES,
         long_runs=long_runs,
         usual_rtol=USUAL_RTOL,
@@ -75,7 +75,7 @@ def page(cells: pd.DataFrame, long_runs: Sequence[LongRun]) -> str:
 
 
 def _summary(cells: pd.DataFrame) -> pd.DataFrame:
-    """Count verdicts by group, and find the largest errors of those within, in units of what is allowed."""
+    """Count verdicts by group, with the largest error of the cells within tolerance over the allowed error."""
     counts = pd.crosstab(cells.group, cells.verdict).reindex(
         index=cells.group.unique(), columns=["within", "stopped", "FAILED"], fill_value=0
     )
@@ -86,7 +86,7 @@ def _summary(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _table(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return cases by ways, or ways by cases where there are more of those."""
+    """Return a table of cases (rows) and ways, transposed if there are more ways than cases."""
     cases, ways = cells.case.unique(), cells.way.unique()
     table = cells.pivot(index="case", columns="way", values="entry").reindex(index=cases, columns=ways).fillna("")
     if len(cases) < len(ways):

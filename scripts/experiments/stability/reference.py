@@ -1,4 +1,4 @@
-"""What each case is compared with: never the solver that is measured, nor its equations."""
+"""References of the cases, computed without the measured solver and its equations."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from ckc_pin.run.run import Run
 from scripts.experiments.stability.equations import Control, Reduced, free_motion, miss, to_absolute, uncontrolled
 from scripts.experiments.stability.planar import Planar
 
-__all__ = ["ByHand", "Known", "OneAngle", "Reference", "Returns", "gap"]
+__all__ = ["ByHand", "OneAngle", "PublishedValues", "Reference", "Returns", "gap"]
 
 TIGHT = 1e-13
-NOT_STIFF = ("DOP853", TIGHT), ("LSODA", 1e-12)  # the right answer, and another by which its uncertainty is known
+NOT_STIFF = ("DOP853", TIGHT), ("LSODA", 1e-12)  # the reference, and a second solver for its uncertainty
 STIFF = ("LSODA", TIGHT), ("LSODA", 1e-12)
-LAYER = 40.0  # epsilons, after which w is no more
+LAYER = 40.0  # t / epsilon after which w is zero
 
 
 class Reference(Protocol):
-    """Where the right answer comes from; all errors are relative to the solution's scale (`gap`)."""
+    """A reference solution. All errors are relative to the solution's scale (`gap`)."""
 
     @property
     def source(self) -> str:
-        """A few words."""
+        """Short description of the source."""
 
     def error(self, run: Run) -> float:
-        """Largest error of a run over its output instants; NaN where none is known."""
+        """Return the largest error of a run over its output instants, NaN if there is no reference value."""
 
     def uncertainty(self, run: Run) -> float:
-        """How far the right answer itself may be off."""
+        """Return an error bound of the reference."""
 
     def phi(self, run: Run) -> float:
-        """Largest |phi - w| of a run over its output instants, m."""
+        """Return the largest |phi - w| of a run over its output instants, m."""
 
 
 def gap(ours: Array, right: Array) -> float:
-    """Largest difference, relative to the largest value that is right, or to 1 where that is smaller."""
+    """Return the largest difference, relative to the largest reference value or to 1 if that is larger."""
     if not np.all(np.isfinite(ours)):
         return float("inf")
     return float(np.abs(ours - right).max(initial=0.0)) / max(1.0, float(np.abs(right).max(initial=0.0)))
@@ -48,10 +48,11 @@ def gap(ours: Array, right: Array) -> float:
 
 @dataclass
 class ByHand:
-    """The five-bar's equations of `equations`, integrated by SciPy at 1e-13 from the run's own start.
+    """The five-bar's `equations`, integrated by SciPy at 1e-13 from the start of the run.
 
-    Without a control and with w(0) = 0 in the links' angles; else eq. 6 on circles that intersect. Where gains or
-    dampers are `stiff`, by LSODA. The uncertainty is the difference from LSODA at ten times the tolerance.
+    The free motion with w(0) = 0 is integrated in the links' angles, any other by eq. 6 with intersecting circles.
+    `stiff` gains or dampers are integrated by LSODA. The uncertainty is the difference from LSODA at ten times the
+    tolerance.
     """
 
     planar: Planar
@@ -59,7 +60,7 @@ class ByHand:
     w: tuple[float, float] = (0.0, 0.0)
     epsilon: float = 1.0
     stiff: bool = False
-    _known: dict[tuple[bytes, ...], Array] = field(default_factory=dict)
+    _solutions: dict[tuple[bytes, ...], Array] = field(default_factory=dict)
 
     @property
     def on_level(self) -> bool:
@@ -68,15 +69,15 @@ class ByHand:
 
     @property
     def source(self) -> str:
-        """Which of the two."""
+        """Short description of the equations."""
         what = "eq. 6" if self.on_level else "links"
         return f"{what} by hand, {'LSODA' if self.on_level or self.stiff else 'DOP853'} at {TIGHT:g}"
 
     def error(self, run: Run) -> float:
-        """Compare angles and rates; of an SPF off its manifold the rates of theta_1 and theta_3 alone."""
+        """Compare angles and rates; for an SPF off its manifold only the rates of theta_1 and theta_3."""
         right = self._motion(run)
         if not np.all(np.isfinite(right)):
-            return float("inf" if run.status == "done" else "nan")  # the equations have no solution there
+            return float("inf" if run.status == "done" else "nan")  # the equations have no solution
         return self._gap(np.hstack([run.q_tree, run.v_tree]), right)
 
     def uncertainty(self, run: Run) -> float:
@@ -89,18 +90,18 @@ class ByHand:
         return max(gap(ours[:, :4], right[:, :4]), gap(ours[:, rates], right[:, rates]))
 
     def phi(self, run: Run) -> float:
-        """Measure |phi - w| with the closure written by hand."""
+        """Return the largest |phi - w| by the closure of `equations`."""
         w = np.array(self.w)[None, :] * np.exp(-run.t / self.epsilon)[:, None]
         return float(np.abs([miss(self.planar, to_absolute(q.tolist())) for q in run.q_tree] - w).max())
 
     def _motion(self, run: Run, looser: bool = False) -> Array:
-        """(theta, theta_dot) at a run's instants from its own start, shape (m, 8); NaN from where they end."""
+        """Return (theta, theta_dot) at a run's instants from its start, shape (m, 8), NaN after their end."""
         theta, theta_dot = run.q_tree[0], run.v_tree[0]
         key = (run.t.tobytes(), theta.tobytes(), theta_dot.tobytes(), bytes([looser]))
-        if key not in self._known:
+        if key not in self._solutions:
             integrate = self._on_level if self.on_level else self._free
-            self._known[key] = integrate(run.t, theta, theta_dot, looser)
-        return self._known[key]
+            self._solutions[key] = integrate(run.t, theta, theta_dot, looser)
+        return self._solutions[key]
 
     def _free(self, t: Array, theta: Array, theta_dot: Array, looser: bool) -> Array:
         start = np.array([*to_absolute(theta.tolist()), *to_absolute(theta_dot.tolist())])
@@ -125,16 +126,16 @@ class ByHand:
         states = [now(float(s), row) for s, row in zip(t, y, strict=True) if np.isfinite(row[0])]
         angles = np.unwrap(_to_joints(np.array([s.a for s in states])), axis=0)
         angles += 2 * np.pi * np.round((theta - angles[0]) / (2 * np.pi))
-        found = np.full((len(t), 8), np.nan)
-        found[: len(states)] = np.hstack([angles, _to_joints(np.array([s.r for s in states]))])
-        return found
+        solution = np.full((len(t), 8), np.nan)
+        solution[: len(states)] = np.hstack([angles, _to_joints(np.array([s.r for s in states]))])
+        return solution
 
     def _integrate(
         self, rate: Callable[..., Array | list[float]], t: Array, y: Array, method: str, rtol: float
     ) -> Array:
-        """Integrate; the boundary layer of w on its own, so that no step reaches into it.
+        """Integrate to the instants, with the boundary layer of w as a separate interval.
 
-        DOP853 is stopped at each instant, since its output between steps is less accurate than they are.
+        DOP853 is stopped at each instant, since its interpolant is less accurate than its steps.
         """
         from scipy.integrate import solve_ivp
 
@@ -147,7 +148,7 @@ class ByHand:
             times = np.union1d(t[within], [end])
             try:
                 solution = solve_ivp(rate, (begin, end), y, method, times, rtol=rtol, atol=1e-3 * rtol)
-            except (ArithmeticError, ValueError):  # circles that do not meet
+            except (ArithmeticError, ValueError):  # the circles do not intersect
                 break
             if not solution.success:
                 break
@@ -161,30 +162,30 @@ def _to_joints(a: Array) -> Array:
 
 
 @dataclass
-class _Given:
-    """Right by publication; the closure as the run itself says."""
+class _Published:
+    """Base of published references; phi is taken from the run."""
 
     source: str
     digits: float
 
     def uncertainty(self, run: Run) -> float:
-        """As many digits as are published."""
+        """Return the error bound from the number of published digits."""
         return self.digits
 
     def phi(self, run: Run) -> float:
-        """As the run itself says."""
+        """Return the run's own largest |phi|."""
         return run.max_phi
 
 
 @dataclass
-class Known(_Given):
-    """Values at the end of the run by coordinate, or of points (m)."""
+class PublishedValues(_Published):
+    """Published values at the end of a run: coordinates, or positions of points (m)."""
 
     coordinates: Mapping[str, float] = field(default_factory=dict)
     points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def error(self, run: Run) -> float:
-        """Compare the end, if it was reached."""
+        """Compare the end of the run, if it was reached."""
         if run.status != "done":
             return float("nan")
         ours = [run.q_tree[-1, run.column(name)] for name in self.coordinates]
@@ -194,11 +195,11 @@ class Known(_Given):
 
 
 @dataclass
-class Returns(_Given):
-    """A motion that ends as it began: after a whole period from rest."""
+class Returns(_Published):
+    """A published period: the motion from rest ends in its start."""
 
     def error(self, run: Run) -> float:
-        """Compare the end, if it was reached, with the start."""
+        """Compare the end of the run, if it was reached, with the start."""
         if run.status != "done":
             return float("nan")
         return max(gap(run.q_tree[-1], run.q_tree[0]), gap(run.v_tree[-1], np.zeros(run.v_tree.shape[1])))
@@ -206,7 +207,7 @@ class Returns(_Given):
 
 @dataclass
 class OneAngle:
-    """The N-four-bar: all rods at one angle, theta'' = -k cos(theta), psi = -theta."""
+    """The N-four-bar, whose rods all have one angle: theta'' = -k cos(theta), psi = -theta."""
 
     k: float
     source: str = "closed form theta'' = -k cos(theta), DOP853 at 1e-13"
@@ -222,7 +223,7 @@ class OneAngle:
         return gap(self._motion(run, 10 * TIGHT), self._motion(run, TIGHT))
 
     def phi(self, run: Run) -> float:
-        """As the run itself says."""
+        """Return the run's own largest |phi|."""
         return run.max_phi
 
     def _motion(self, run: Run, rtol: float) -> Array:

@@ -1,4 +1,4 @@
-"""The stability suite: cases x formulations x methods, each measured against a reference of its own, and long runs."""
+"""Run the stability suite: cases in several formulations and methods, and long runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from joblib import Parallel, delayed, parallel_config
 
 from scripts.experiments.stability.cases import GROUPS
 from scripts.experiments.stability.cell import Cell, run_case
-from scripts.experiments.stability.long_runs import LONG, LongRun, long_run
+from scripts.experiments.stability.long_runs import LONG_RUN_SETTINGS, LongRun, long_run
 
 __all__ = ["LONG_RUNS", "NAMES", "measure"]
 
@@ -18,14 +18,14 @@ NAMES = (*GROUPS, LONG_RUNS)
 
 
 def measure(names: Collection[str]) -> tuple[list[Cell], list[LongRun]]:
-    """Run groups of `NAMES` by two processes, the long runs first."""
-    long = [delayed(long_run)(*args) for args in LONG] if LONG_RUNS in names else []
+    """Run groups of `NAMES` in parallel processes, the long runs first."""
+    long = [delayed(long_run)(*args) for args in LONG_RUN_SETTINGS] if LONG_RUNS in names else []
     rows = [delayed(_one)(group, case.name) for group in GROUPS if group in names for case in GROUPS[group]()]
     with parallel_config("loky", n_jobs=WORKERS, inner_max_num_threads=1):
-        found = Parallel(verbose=5)([*long, *rows])
-    return [cell for row in found[len(long) :] for cell in row], found[: len(long)]
+        results = Parallel(verbose=5)([*long, *rows])
+    return [cell for row in results[len(long) :] for cell in row], results[: len(long)]
 
 
 def _one(group: str, name: str) -> list[Cell]:
-    """Find a case again in another process: its reference is a function, which cannot be sent."""
+    """Run a case by its name, since its reference is a function, which cannot be sent to another process."""
     return run_case(next(case for case in GROUPS[group]() if case.name == name))

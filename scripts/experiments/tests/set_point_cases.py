@@ -1,4 +1,4 @@
-"""What the tests of set-point control's analysis share: chains of point masses, and the five-bar of the appendix."""
+"""Mechanisms and references for tests of set-point control: chains of point masses, and the appendix's five-bar."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array
 
 G = 9.81
-NEAR = {"initial.at": None, "initial.q": {"theta_1": 0.3, "theta_3": 0.5}}  # a start half a radian from the target
+NEAR_START = {"initial.at": None, "initial.q": {"theta_1": 0.3, "theta_3": 0.5}}  # half a radian from q_d
 
 
-class Given(NamedTuple):
-    """What `certify` takes."""
+class CertifyArguments(NamedTuple):
+    """Arguments of `certify`."""
 
     mechanism: Mechanism
     controller: SetPoint
     start: Start
 
 
-def given(overrides: Mapping[str, Any] | None = None) -> Given:
-    """The five-bar's set-point scene with values replaced by dotted key."""
+def load_arguments(overrides: Mapping[str, Any] | None = None) -> CertifyArguments:
+    """Load the five-bar's set-point scene with overrides by dotted key."""
     loaded = load_scene("five_bar/set_point", overrides)
     mechanism = load_scene_mechanism(loaded)
     controller = build_scene_controller(loaded, mechanism)
     assert isinstance(controller, SetPoint)
-    return Given(mechanism, controller, find_start(mechanism, loaded))
+    return CertifyArguments(mechanism, controller, find_start(mechanism, loaded))
 
 
 def pendulum(links: int) -> Mechanism:
-    """A chain of point masses of 1 kg on massless rods of 1 m, angles from +x, gravity along -y."""
+    """Return a chain of point masses of 1 kg on massless rods of 1 m, angles from +x, gravity along -y."""
     parts, parent, x = ['<link name="base"/>'], "base", 0.0
     for k in range(1, links + 1):
         parts.append(
@@ -56,13 +56,13 @@ def pendulum(links: int) -> Mechanism:
 
 
 def at_rest(mechanism: Mechanism, q: list[float]) -> Start:
-    found = sigma(mechanism, np.array(q))
-    assert found.verdict == "converged"
-    return Start(found.at, np.zeros(mechanism.d), np.zeros(mechanism.closure.rows))
+    solution = sigma(mechanism, np.array(q))
+    assert solution.verdict == "converged"
+    return Start(solution.at, np.zeros(mechanism.d), np.zeros(mechanism.closure.rows))
 
 
 def five_bar_U(controller: SetPoint, q: Array) -> float:
-    """V_L at rest by the numpy five-bar."""
+    """Return V_L at rest by the numpy five-bar."""
     q_d = controller.q_d
     h_d, V_d = FIVE_BAR.h(FIVE_BAR.sigma(q_d)), FIVE_BAR.potential_energy(FIVE_BAR.sigma(q_d))
     e = q - q_d
@@ -70,13 +70,13 @@ def five_bar_U(controller: SetPoint, q: Array) -> float:
 
 
 def five_bar_gradient(q: Array, step: float, branch: int = 1) -> Array:
-    """dh/dq by fourth-order central differences of the numpy five-bar's h."""
+    """Return dh/dq by fourth-order central differences of the numpy five-bar's h."""
     h = [[FIVE_BAR.h(FIVE_BAR.sigma(q + k * step * e, branch)) for k in (1, -1, 2, -2)] for e in np.eye(2)]
     return np.array([(8 * (a - b) - (c - d)) / (12 * step) for a, b, c, d in h]).T
 
 
 def five_bar_border(s: float, count: int) -> Array:
-    """Points (theta_1, theta_3) with |s| = s: with l2 = l4 the elbows are 2 l2 sin(gamma/2) apart, s = sin gamma."""
+    """Return points (theta_1, theta_3) with |s| = s: the elbows are 2 l2 sin(gamma/2) apart, s = sin gamma."""
     l, points = FIVE_BAR.l, []
     for gamma in (np.arcsin(s), np.pi - np.arcsin(s)):
         distance = 2 * l[1] * np.sin(gamma / 2)

@@ -1,4 +1,4 @@
-"""The cost study: what it counts, which tolerance it takes, when it gives up."""
+"""The cost study: counts, choice of the tolerance, and budget."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scripts.experiments.paper.experiment import Outcome, Problem, difference, e
 from tests.conftest import assert_close
 
 SWING = Path(__file__).parents[3] / "tests" / "regression" / "data" / "swing.json"
-SHORT = 0.3
+SHORT_S = 0.3
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +31,16 @@ def problem() -> Problem:
 # --- marching ----------------------------------------------------------------------------------------------------
 
 
-def test_problem_of_a_scene_is_the_reference_trajectory() -> None:
+def test_problem_of_scene_matches_reference_trajectory() -> None:
     data = json.loads(SWING.read_text())
     problem = Problem.of_scene(load_scene("five_bar/swing"))
     times = np.array([0.0, *data["t"]])
-    found = sample(problem.dae(), "DOP853", 1e-12, times)
-    assert_close([terms.q_tree for terms in found[1:]], data["q_tree"], 1e-9)
-    assert_close([terms.q_dot for terms in found[1:]], np.array(data["v_tree"])[:, [0, 2]], 1e-9)
+    states = sample(problem.dae(), "DOP853", 1e-12, times)
+    assert_close([terms.q_tree for terms in states[1:]], data["q_tree"], 1e-9)
+    assert_close([terms.q_dot for terms in states[1:]], np.array(data["v_tree"])[:, [0, 2]], 1e-9)
 
 
-def test_problem_of_a_scene_takes_its_controller_along() -> None:
+def test_problem_of_scene_has_its_controller() -> None:
     problem = Problem.of_scene(load_scene("five_bar/tracking"))
     a, b = (end_of(system, "Radau", 1e-7, 0.2) for system in (problem.reduced(), problem.printed_spf(1e-3)))
     free = Problem.free(problem.mechanism, problem.at, problem.q_dot)
@@ -52,7 +52,7 @@ def test_problem_of_a_scene_takes_its_controller_along() -> None:
     ("method", "module", "name"),
     [("BDF", bdf, "solve_bdf_system"), ("Radau", radau, "solve_collocation_system")],
 )
-def test_iterations_are_those_of_the_integrator(
+def test_newton_iterations_are_recovered_from_nfev(
     problem: Problem, monkeypatch: pytest.MonkeyPatch, method: str, module: Any, name: str
 ) -> None:
     counted, tried = 0, set[tuple[float, float]]()
@@ -66,25 +66,25 @@ def test_iterations_are_those_of_the_integrator(
         return result
 
     monkeypatch.setattr(module, name, counting)
-    outcome = march(problem.printed_spf(1e-3), method, 1e-5, SHORT)
+    outcome = march(problem.printed_spf(1e-3), method, 1e-5, SHORT_S)
     assert outcome.iterations is not None
-    slack = (len(tried) - outcome.stats["steps"]) / 3 if method == "Radau" else 0
-    assert counted <= outcome.iterations <= counted + slack
+    tolerance = (len(tried) - outcome.stats["steps"]) / 3 if method == "Radau" else 0
+    assert counted <= outcome.iterations <= counted + tolerance
     assert counted > outcome.stats["steps"]
 
 
-def test_explicit_methods_iterate_never_and_lsoda_does_not_tell(problem: Problem) -> None:
-    assert march(problem.reduced(), "DOP853", 1e-5, SHORT).iterations == 0
-    assert march(problem.reduced(), "LSODA", 1e-5, SHORT).iterations is None
+def test_explicit_methods_have_no_iterations_and_lsoda_none(problem: Problem) -> None:
+    assert march(problem.reduced(), "DOP853", 1e-5, SHORT_S).iterations == 0
+    assert march(problem.reduced(), "LSODA", 1e-5, SHORT_S).iterations is None
 
 
 def test_only_the_reduced_model_solves_for_sigma(problem: Problem) -> None:
-    assert march(problem.reduced(), "DOP853", 1e-6, SHORT).stats["newton"] > 0
-    assert march(problem.printed_spf(1e-2), "DOP853", 1e-6, SHORT).stats["newton"] == 0
+    assert march(problem.reduced(), "DOP853", 1e-6, SHORT_S).stats["newton"] > 0
+    assert march(problem.printed_spf(1e-2), "DOP853", 1e-6, SHORT_S).stats["newton"] == 0
 
 
 def test_explicit_right_hand_sides_grow_like_one_over_epsilon(problem: Problem) -> None:
-    rhs = [march(problem.printed_spf(epsilon), "DOP853", 1e-5, SHORT).stats["rhs"] for epsilon in (1e-3, 1e-4)]
+    rhs = [march(problem.printed_spf(epsilon), "DOP853", 1e-5, SHORT_S).stats["rhs"] for epsilon in (1e-3, 1e-4)]
     assert 8 < rhs[1] / rhs[0] < 12
 
 
@@ -92,31 +92,31 @@ def test_explicit_right_hand_sides_grow_like_one_over_epsilon(problem: Problem) 
 
 
 @pytest.mark.parametrize("first", [1e-3, 1e-6, 1e-10])
-def test_loosest_tolerance_is_found_from_wherever_it_begins(problem: Problem, first: float) -> None:
+def test_loosest_tolerance_is_independent_of_first_tolerance(problem: Problem, first: float) -> None:
     search = Search(target=2e-8)
-    reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT)
+    reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT_S)
     errors = [
-        max(difference(reference, march(problem.reduced(), "DOP853", rtol, SHORT).terms)) for rtol in search.rtols
+        max(difference(reference, march(problem.reduced(), "DOP853", rtol, SHORT_S).terms)) for rtol in search.rtols
     ]
     reaching = [error <= search.target for error in errors]
     k = reaching.index(True)
     assert 0 < k < len(errors) - 1
     assert all(reaching[k:]), "a search from both sides needs one place where the target is crossed"
-    found = cost_at_equal_error(Cost("reduced", None, "DOP853"), problem.reduced, reference, SHORT, search, first)
-    assert (found.rtol, found.error, found.reason) == (search.rtols[k], errors[k], "")
+    cost = cost_at_equal_error(Cost("reduced", None, "DOP853"), problem.reduced, reference, SHORT_S, search, first)
+    assert (cost.rtol, cost.error, cost.reason) == (search.rtols[k], errors[k], "")
 
 
-def test_a_method_that_never_reaches_the_target_says_so(problem: Problem) -> None:
-    reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT)
+def test_unreached_target_gives_reason(problem: Problem) -> None:
+    reference = end_of(problem.dae(), "DOP853", 1e-12, SHORT_S)
     search = Search(rtols=(1e-3, 1e-4), target=1e-14)
-    found = cost_at_equal_error(Cost("reduced", None, "DOP853"), problem.reduced, reference, SHORT, search, 1e-3)
-    assert found.rtol == 1e-4
-    assert found.reason
-    assert found.error > search.target
+    cost = cost_at_equal_error(Cost("reduced", None, "DOP853"), problem.reduced, reference, SHORT_S, search, 1e-3)
+    assert cost.rtol == 1e-4
+    assert cost.reason
+    assert cost.error > search.target
 
 
-def test_budget_stops_and_smaller_epsilons_are_not_tried(problem: Problem) -> None:
-    costs = study(problem, SHORT, (1e-2, 1e-4, 1e-5), ("DOP853",), Search(max_rhs=600))
+def test_smaller_epsilons_are_skipped_after_budget_is_exhausted(problem: Problem) -> None:
+    costs = study(problem, SHORT_S, (1e-2, 1e-4, 1e-5), ("DOP853",), Search(max_rhs=600))
     assert [(c.formulation, c.epsilon) for c in costs] == [
         ("reduced", None),
         ("DAE", None),
@@ -128,7 +128,7 @@ def test_budget_stops_and_smaller_epsilons_are_not_tried(problem: Problem) -> No
     assert done.reason == ""
     assert done.error <= Search().target
     assert stopped.outcome is not None
-    assert stopped.outcome.t < SHORT
+    assert stopped.outcome.t < SHORT_S
     assert stopped.outcome.stats["rhs"] == 600
     assert stopped.reason
     assert untried.outcome is None
@@ -149,7 +149,9 @@ def fake(problem: Problem, formulation: str, epsilon: float | None, seconds: flo
     ("seconds", "newton", "verdict"),
     [(0.5, 0, "holds"), (2.0, 0, "holds with a condition"), (0.5, 7, "does not hold")],
 )
-def test_verdict_counts_both_sides(problem: Problem, tmp_path: Path, seconds: float, newton: int, verdict: str) -> None:
+def test_verdict_depends_on_time_and_newton_iterations(
+    problem: Problem, tmp_path: Path, seconds: float, newton: int, verdict: str
+) -> None:
     stopped = replace(fake(problem, "eq. 8", 1e-5, 9.0, 0), reason="stopped at t = 1 s: the budget")
     costs = [
         fake(problem, "reduced", None, 1.0, 150),

@@ -1,4 +1,4 @@
-"""Each erratum's number against the same number from the numpy five-bar, or from a closed form."""
+"""Numbers of the errata against the numpy five-bar or a closed form."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def erratum(key: str) -> Erratum:
 
 
 def states() -> list[tuple[Array, Array]]:
-    """The states that eq. 25 is compared at."""
+    """Return the states at which eq. 25 is compared."""
     random = np.random.default_rng(0)
     return [(random.uniform(-np.pi, np.pi, 4), random.uniform(-3, 3, 4)) for _ in range(200)]
 
 
 def level(w: Array, start: Array) -> Array:
-    """q' with phi = w at the q of a closed configuration, by Newton."""
+    """Return q' with phi = w at the q of a closed configuration, by Newton."""
     q_tree = start.copy()
     for _ in range(30):
         q_tree[[1, 3]] -= np.linalg.solve(FIVE_BAR.phi_z(q_tree), FIVE_BAR.phi(q_tree) - w)
@@ -46,7 +46,7 @@ def level(w: Array, start: Array) -> Array:
 
 
 def multipliers() -> float:
-    """The tree alone falls for 0.1 s."""
+    """Return the residual phi after the open tree has fallen for 0.1 s."""
 
     def chains(t: float, y: Array) -> Array:
         q, v = y[:4], y[4:]
@@ -89,8 +89,8 @@ def elbows(model: FiveBar, t: float) -> float:
 
 
 def table_rows() -> float:
-    found = minimize_scalar(lambda t: -elbows(AS_PRINTED, t), bounds=(4.0, 5.0), method="bounded")
-    return float(-found.fun - AS_PRINTED.l[1] - AS_PRINTED.l[3])
+    widest = minimize_scalar(lambda t: -elbows(AS_PRINTED, t), bounds=(4.0, 5.0), method="bounded")
+    return float(-widest.fun - AS_PRINTED.l[1] - AS_PRINTED.l[3])
 
 
 def type_1_points() -> float:
@@ -100,7 +100,7 @@ def type_1_points() -> float:
 
 
 def slow() -> Array:
-    """Rate of sigma's z along q_dot, on the manifold."""
+    """Return the rate of sigma's z along q_dot, on the manifold."""
     return (FIVE_BAR.rho(FIVE_BAR.sigma(SWING)) @ Q_DOT)[[1, 3]]
 
 
@@ -140,7 +140,7 @@ def equilibrium_sign() -> float:
 
 
 def lyapunov_rate() -> float:
-    """The printed line nearer to the truth at t = 1 s."""
+    """Return the smaller error of the printed lines at t = 1 s."""
     control = tracking(FIVE_BAR)
     start = FIVE_BAR.equilibrium()[[0, 2]]
 
@@ -169,50 +169,50 @@ EXPECTED: dict[str, Callable[[], float]] = {
         rate_on_trajectory,
     )
 } | {"boundary-layer-sign": lambda: 1.0, "gain-condition": lambda: 1.0}  # fmt: skip
-RANGES = {"psi-determinant": (1.4, 2.0), "lost-freedoms": (0.19, 0.25)}  # they depend on the points found
+RANGES = {"psi-determinant": (1.4, 2.0), "lost-freedoms": (0.19, 0.25)}  # these depend on random points
 
 
-def test_every_erratum_has_an_independent_number() -> None:
+def test_each_erratum_has_an_independent_value() -> None:
     assert set(EXPECTED) | set(RANGES) == set(ERRATA)
 
 
 @pytest.mark.parametrize("key", EXPECTED)
-def test_printed_form_is_off_by(key: str) -> None:
+def test_error_of_printed_form_equals_independent_value(key: str) -> None:
     assert_close(erratum(key).difference, EXPECTED[key](), 1e-5, relative=True)
 
 
 @pytest.mark.parametrize("key", RANGES)
-def test_printed_form_is_off_within(key: str) -> None:
+def test_error_of_printed_form_is_in_range(key: str) -> None:
     low, high = RANGES[key]
     assert low < erratum(key).difference < high
 
 
 @pytest.mark.parametrize("key", ERRATA)
-def test_correct_form_is_right(key: str) -> None:
-    found = erratum(key)
-    assert found.key == key
-    assert found.agreement <= 1e-6 * found.difference
+def test_correct_form_agrees_to_rounding(key: str) -> None:
+    computed = erratum(key)
+    assert computed.key == key
+    assert computed.agreement <= 1e-6 * computed.difference
 
 
-def test_swing_start_is_the_one_here() -> None:
-    """The tests of eqs. 11 and 16 above take the start of five_bar/swing."""
+def test_swing_start_equals_start_of_scene() -> None:
+    """The values of eqs. 11 and 16 above use the start of five_bar/swing."""
     assert_close(SWING, FIVE_BAR.equilibrium()[[0, 2]] + 0.5, 1e-8)
 
 
-def test_the_page_has_every_erratum_with_its_numbers() -> None:
-    found = [erratum(key) for key in ERRATA]
+def test_errata_page_lists_all_errata_with_numbers() -> None:
+    errata = [erratum(key) for key in ERRATA]
     rows = re.findall(
-        r"^\| \[(.*)\]\(#\1\) \|.*\| ([\d.e+-]+) \| ([\d.e+-]+) \| .* \|$", errata_page(found), re.MULTILINE
+        r"^\| \[(.*)\]\(#\1\) \|.*\| ([\d.e+-]+) \| ([\d.e+-]+) \| .* \|$", errata_page(errata), re.MULTILINE
     )
-    assert [(key, float(a)) for key, a, _ in rows] == [(e.key, pytest.approx(e.difference, rel=1e-3)) for e in found]
+    assert [(key, float(a)) for key, a, _ in rows] == [(e.key, pytest.approx(e.difference, rel=1e-3)) for e in errata]
 
 
-def test_the_committed_numbers_are_those_measured() -> None:
+def test_committed_errata_match_measurements() -> None:
     table = pd.read_csv(DOCS / "errata.csv").set_index("key")
     assert table.index.tolist() == list(ERRATA)
     assert len(table) == 18
     for row in table.itertuples():
-        found = erratum(row.Index)
-        assert_close(found.difference, row.difference, 5e-3, relative=True)
-        assert found.unit == row.unit
+        computed = erratum(row.Index)
+        assert_close(computed.difference, row.difference, 5e-3, relative=True)
+        assert computed.unit == row.unit
         assert row.agreement <= 1e-6 * row.difference

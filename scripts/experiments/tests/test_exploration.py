@@ -17,7 +17,7 @@ from scripts.experiments.tests.set_point_cases import pendulum
 from tests.conftest import Pair, assert_close
 
 
-def test_flood_finds_the_disc_and_its_edges() -> None:
+def test_flood_explores_disc_and_its_edges() -> None:
     mechanism = pendulum(2)
     centre = mechanism.assembled
     explored = explore(mechanism, centre, np.full(2, 0.1), lambda at: float(np.sum(at.q_tree**2)), 1.0)
@@ -30,7 +30,7 @@ def test_flood_finds_the_disc_and_its_edges() -> None:
     assert not explored.full
 
 
-def test_water_has_to_rise_over_the_ridge() -> None:
+def test_node_behind_ridge_has_level_of_ridge() -> None:
     """A node behind a ridge is connected at the ridge's height, not at its own."""
     mechanism = pendulum(1)
 
@@ -44,7 +44,7 @@ def test_water_has_to_rise_over_the_ridge() -> None:
     assert len(explored.nodes) == 63  # the lattice meets itself after a turn
 
 
-def test_rays_stay_below_the_level() -> None:
+def test_rays_stay_below_level() -> None:
     mechanism = pendulum(3)
     explored = explore(mechanism, mechanism.assembled, np.full(3, 0.2), lambda at: float(np.sum(at.q_tree**2)), 1.0)
     radii = np.array([np.linalg.norm(at.q_tree) for at in explored.nodes])
@@ -54,7 +54,7 @@ def test_rays_stay_below_the_level() -> None:
     assert len(np.unique(directions, axis=0)) == 8
 
 
-def test_least_goes_down_to_a_constrained_minimum() -> None:
+def test_find_minimum_reaches_constrained_minimum() -> None:
     mechanism = pendulum(2)
     found = find_minimum(
         mechanism,
@@ -66,7 +66,7 @@ def test_least_goes_down_to_a_constrained_minimum() -> None:
     assert_close(found.q_tree, [0.5, 0.0], 3e-3)
 
 
-def test_follow_stops_where_the_loops_cannot_close(five_bar: Pair) -> None:
+def test_follow_stops_at_end_of_branch(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     at, reached = follow(mechanism, sigma(mechanism, np.array([0.0, 0.5])).at, np.array([3.0, -0.5]))
     assert 0 < reached < 1

@@ -1,4 +1,4 @@
-"""dh/dq's bounds on a branch and along a trajectory, against the five-bar of the appendix in numpy."""
+"""Bounds of dh/dq on a branch and along a trajectory, against the appendix's five-bar in numpy."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def bounds_on(mechanism: Mechanism, branch: Kinematics, margins: list[float]) ->
 
 @pytest.fixture(scope="module")
 def bounds(five_bar: Pair) -> dict[float, Bound]:
-    """On the own branch, by the least margin, of one exploration."""
+    """Bounds on the assembled branch by margin, from one exploration."""
     mechanism, _ = five_bar
     margins = [0.5, 0.1]
     return dict(zip(margins, bounds_on(mechanism, mechanism.assembled, margins), strict=True))
 
 
 @pytest.mark.parametrize(("s_min", "finer"), [(0.5, 1e-3), (0.1, 1e-4)])
-def test_bounds_are_the_extremes_on_the_border(bounds: dict[float, Bound], s_min: float, finer: float) -> None:
+def test_bounds_equal_extremes_on_border(bounds: dict[float, Bound], s_min: float, finer: float) -> None:
     bound = bounds[s_min]
     border = [five_bar_gradient(q, finer) for q in five_bar_border(s_min, 600)]
     assert_close(bound.norm, max(np.linalg.norm(g, 2) for g in border), 1e-3, relative=True)
@@ -52,29 +52,29 @@ def test_bounds_are_the_extremes_on_the_border(bounds: dict[float, Bound], s_min
         assert value <= np.linalg.norm(five_bar_gradient(q, finer), 2) * (1 + 1e-5)
 
 
-def test_the_other_branch_is_the_mirror_image(five_bar: Pair, bounds: dict[float, Bound]) -> None:
-    """Reflected in the base line gravity points up: dh/dq changes its sign."""
+def test_other_branch_has_mirrored_bounds(five_bar: Pair, bounds: dict[float, Bound]) -> None:
+    """The mirror image at the base line has gravity upwards, so dh/dq changes its sign."""
     mechanism, _ = five_bar
     _, other = assembly_branches(mechanism)
-    (mirrored,), own = bounds_on(mechanism, other, [0.5]), bounds[0.5]
-    assert_close(mirrored.norm, own.norm, 2e-3, relative=True)
-    assert_close(mirrored.low, -own.norm, 2e-3, relative=True)  # the norm is a positive eigenvalue's
-    assert own.low > mirrored.low + 1
+    (mirrored,), assembled = bounds_on(mechanism, other, [0.5]), bounds[0.5]
+    assert_close(mirrored.norm, assembled.norm, 2e-3, relative=True)
+    assert_close(mirrored.low, -assembled.norm, 2e-3, relative=True)  # the norm is that of a positive eigenvalue
+    assert assembled.low > mirrored.low + 1
 
 
-def test_bound_along_a_trajectory(five_bar: Pair) -> None:
+def test_bound_along_trajectory_equals_numpy_five_bar(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     waves = [(np.pi / 3, 1.0, 0.0)], [(np.pi / 4, 1.0, -np.pi / 2)]
     desired = Harmonics([HarmonicsSpec(harmonics=waves[0]), HarmonicsSpec(offset=np.pi / 4, harmonics=waves[1])])
     times = np.linspace(0, 2 * np.pi, 100)
     gradients = [five_bar_gradient(desired(t)[0], 1e-3) for t in times]
-    found = bound_along(mechanism, desired, times)
-    assert_close(found.norm, max(np.linalg.norm(g, 2) for g in gradients), 1e-8, relative=True)
+    bound = bound_along(mechanism, desired, times)
+    assert_close(bound.norm, max(np.linalg.norm(g, 2) for g in gradients), 1e-8, relative=True)
     with pytest.raises(InputError, match="leaves the branch"):
         bound_along(load("five_bar_as_printed"), desired, times)
 
 
-def test_margin_is_the_sine_between_the_distal_links(five_bar: Pair) -> None:
+def test_margin_is_sine_between_distal_links(five_bar: Pair) -> None:
     mechanism, numpy_twin = five_bar
     for q in np.random.default_rng(1).uniform(-0.8, 0.8, (10, 2)):
         at = sigma(mechanism, q).at

@@ -1,4 +1,4 @@
-"""What scenes leave out, and how cost grows: what is measured is what is said to be."""
+"""Measurements of unused modules and terms, and of the growth of cost."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from scripts.experiments.benchmark import growth, left_out
 from scripts.experiments.benchmark.left_out import module_costs, modules_of, terms_of
 from tests.conftest import assert_close
 
-# --- what a scene leaves out ------------------------------------------------------------------------------------------
+# --- unused modules and terms ----------------------------------------------------------------------------------------
 
 
-def test_an_acceleration_leaves_out_what_it_does_not_need() -> None:
+def test_right_hand_sides_evaluate_only_needed_terms() -> None:
     used = {
         (scene, formulation): {row.what for row in terms_of(scene, {"formulation": formulation}) if row.used}
         for scene, formulation in (
             ("five_bar/swing", "dae"), ("five_bar/swing", "reduced"), ("five_bar/tracking", "reduced")
         )
     }  # fmt: skip
-    for own in used.values():
-        assert not own & {"ρ̇", "C", "λ", "energy"}
+    for names in used.values():
+        assert not names & {"ρ̇", "C", "λ", "energy"}
     assert "σ" not in used["five_bar/swing", "dae"]
     assert "σ" in used["five_bar/swing", "reduced"]
     assert "C'" not in used["five_bar/swing", "reduced"]
-    assert "C'" in used["five_bar/tracking", "reduced"]  # eq. 16 asks for C
+    assert "C'" in used["five_bar/tracking", "reduced"]  # eq. 16 needs C
 
 
-def test_a_term_left_out_costs_time_and_memory() -> None:
+def test_unused_term_would_cost_time_and_memory() -> None:
     rows = list(terms_of("andrews"))
     for row in rows:
         assert row.rhs_s is not None
@@ -52,37 +52,37 @@ def test_a_term_left_out_costs_time_and_memory() -> None:
     assert list(by_name) == list(left_out.TERMS)
 
 
-def test_a_scene_that_cannot_start_says_why() -> None:
+def test_scene_that_cannot_start_gives_reason() -> None:
     rows = list(terms_of("five_bar/swing", {"initial.q.theta_1": 3.0, "initial.q.theta_3": 0.1}))
     assert [row.what for row in rows] == list(left_out.TERMS)
     assert all(row.reason and row.seconds is None for row in rows)
 
 
-def test_modules_are_seen_in_a_fresh_interpreter() -> None:
+def test_imported_modules_are_detected_in_fresh_interpreter() -> None:
     assert {row.what: row.used for row in modules_of("five_bar/swing", ["msgspec", "this", "no_such"])} == {
         "msgspec": True, "this": False, "no_such": False,
     }  # fmt: skip
     assert all(row.reason for row in modules_of("no_such_scene"))
     big, no = module_costs(1, {"big": ("import numpy; x = numpy.ones(2**22)", ""), "no": ("1 / 0", "")})
     assert big.bytes is not None
-    assert 2**25 - 2**16 <= big.bytes < 2**26  # in pages, of which the interpreter gives some back meanwhile
+    assert 2**25 - 2**16 <= big.bytes < 2**26  # memory is counted in pages, some of which the interpreter releases
     assert big.seconds is not None
     assert big.seconds > 0
     assert "ZeroDivisionError" in no.reason
     assert no.seconds is None
 
 
-def test_every_shipped_scene_is_looked_at() -> None:
+def test_all_shipped_scenes_are_measured() -> None:
     scenes = left_out.every_scene()
     assert {"five_bar/swing", "n_four_bar/default", "talos/squat"} <= set(scenes)
     assert all(load_scene(scene) for scene in scenes)
 
 
-# --- how cost grows -----------------------------------------------------------------------------------------------
+# --- growth of cost -----------------------------------------------------------------------------------------------
 
 
 @given(p=st.floats(-3, 3), factor=st.floats(1e-6, 1e3))
-def test_the_exponent_of_a_power_is_found(p: float, factor: float) -> None:
+def test_exponent_of_power_law_is_fitted(p: float, factor: float) -> None:
     points = {float(x): factor * x**p for x in (1, 2, 4, 8, 16, 40)}
     assert growth.exponent(points, whole=True) == pytest.approx(p, abs=1e-9)
     assert growth.exponent(points) == pytest.approx(p, abs=1e-9)
@@ -93,7 +93,7 @@ def test_the_exponent_of_a_power_is_found(p: float, factor: float) -> None:
 
 
 @pytest.mark.parametrize(("N", "loops"), [(3, 3), (3, 1), (4, 2)])
-def test_a_case_has_the_loops_and_freedoms_it_says(N: int, loops: int, tmp_path: Path) -> None:
+def test_case_has_stated_loops_and_freedoms(N: int, loops: int, tmp_path: Path) -> None:
     case = growth.Case(N, loops)
     mechanism = prepare(load_scene(growth.written(case, tmp_path))).mechanism
     assert (mechanism.n, mechanism.d) == (2 * N + 1, case.d)
@@ -101,7 +101,7 @@ def test_a_case_has_the_loops_and_freedoms_it_says(N: int, loops: int, tmp_path:
     assert np.abs(mechanism.assembled.phi).max() < 1e-12
 
 
-def test_a_case_is_counted_and_timed() -> None:
+def test_case_has_time_and_number_of_right_hand_sides() -> None:
     family = growth.FAMILIES[0]
     for formulation in growth.FORMULATIONS:
         row = growth.measure(growth.Case(2, 2), family, formulation)
@@ -113,14 +113,14 @@ def test_a_case_is_counted_and_timed() -> None:
 
 
 @pytest.mark.parametrize(("overrides", "timed"), [({"solver.max_rhs": 20}, True), ({"formulation": "none"}, False)])
-def test_a_case_that_fails_says_why(overrides: dict[str, object], timed: bool) -> None:
+def test_failing_case_gives_reason(overrides: dict[str, object], timed: bool) -> None:
     row = growth.measure(growth.Case(2, 2), growth.FAMILIES[0], "dae", overrides)
     assert row.rhs is None
     assert (row.rhs_s is not None) == timed
     assert row.reason
 
 
-def test_the_states_that_are_timed_are_those_of_the_motion() -> None:
+def test_timed_states_are_on_the_motion() -> None:
     scene = load_scene("five_bar/swing", {"formulation": "reduced", "t_end": 0.0019, "solver.output_dt": 1e-4})
     ready = prepare(scene)
     ready.begin()

@@ -1,4 +1,4 @@
-"""The report: references against published values, rows that are kept as long as they hold, sentences that follow."""
+"""The benchmark: references against published values, cached rows, and sentences that follow from the tables."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from ckc_pin.analysis.precision.motion import Motion, Setting, motion_without_da
 from ckc_pin.errors import InputError
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark import make, ours
+from scripts.experiments.benchmark.compiled_terms import compiled_terms_cost
 from scripts.experiments.benchmark.peers import peers
 from scripts.experiments.benchmark.reference import Reference, reference
-from scripts.experiments.benchmark.row import judged
+from scripts.experiments.benchmark.row import compare_with_reference
 from scripts.experiments.benchmark.stamp import work_stamp
 from scripts.experiments.benchmark.work import WORKS, Budget, Work
-from scripts.experiments.benchmark.written_out import written_out
 from tests.analytic.five_bar import FIVE_BAR, Q
 
-SHORT = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
-EVERY = {work.key: work for work in WORKS}
+SHORT_WORK = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
+BY_KEY = {work.key: work for work in WORKS}
 DOCS = Path(__file__).parents[3] / "docs" / "report"
 LOOP = "Pinocchio constraintDynamics, RKF78 in C++"
 
 
 @pytest.fixture(scope="module")
 def exact() -> Reference:
-    return reference(SHORT)
+    return reference(SHORT_WORK)
 
 
 # --- references ---------------------------------------------------------------------------------------------------
@@ -47,14 +47,14 @@ def exact() -> Reference:
         ("n_four_bar_40", [0.180512226686728390, 0.983572740582311575, 0.0]),
     ],
 )
-def test_a_row_of_squares_ends_where_forty_digits_say(work: str, B0: list[float]) -> None:
-    """The elliptic functions with mpmath at forty digits; an integration by others agrees with them to 1e-11."""
-    found = reference(EVERY[work])
-    assert np.abs(found.values[-1] - B0).max() < 1e-13
-    assert np.abs(found.values[0] - [0, 1, 0]).max() < 1e-15
+def test_row_of_squares_matches_forty_digit_reference(work: str, B0: list[float]) -> None:
+    """The values are elliptic functions by mpmath at forty digits; an independent integration agrees to 1e-11."""
+    closed_form = reference(BY_KEY[work])
+    assert np.abs(closed_form.values[-1] - B0).max() < 1e-13
+    assert np.abs(closed_form.values[0] - [0, 1, 0]).max() < 1e-15
 
 
-def test_a_reference_knows_how_good_it_is(exact: Reference) -> None:
+def test_reference_accuracy_bounds_its_error(exact: Reference) -> None:
     assert exact.values.shape == (11, 4)
     assert 0 < exact.accuracy < 1e-11
 
@@ -62,9 +62,9 @@ def test_a_reference_knows_how_good_it_is(exact: Reference) -> None:
         return np.concatenate([y[2:], FIVE_BAR.acceleration(FIVE_BAR.sigma(y[:2]), y[2:], np.zeros(2))])
 
     start = np.concatenate(
-        [exact.values[0][Q], [SHORT.load().spec.initial.q_dot.get(x, 0.0) for x in ("theta_1", "theta_3")]]
+        [exact.values[0][Q], [SHORT_WORK.load().spec.initial.q_dot.get(x, 0.0) for x in ("theta_1", "theta_3")]]
     )
-    numpy_run = solve_ivp(rate, (0.0, SHORT.t_end), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:2, -1]
+    numpy_run = solve_ivp(rate, (0.0, SHORT_WORK.t_end), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:2, -1]
     assert np.abs(numpy_run - exact.values[-1][Q]).max() < 1e-10
 
 
@@ -75,11 +75,11 @@ def motion(q_tree: Any, v_tree: Any = None, status: str = "done") -> Motion:
     return Motion(status, "", q_tree, np.zeros_like(q_tree) if v_tree is None else v_tree, 0.5, 0.1, steps=3)
 
 
-def test_errors_are_along_the_run_and_at_its_end(exact: Reference) -> None:
+def test_errors_are_maximum_and_end_of_run(exact: Reference) -> None:
     off = exact.values.copy()
     off[4, 1] += 3e-3
     off[-1, 2] -= 2e-4
-    row = judged(SHORT, "other", "s", motion(off), exact)
+    row = compare_with_reference(SHORT_WORK, "other", "s", motion(off), exact)
     assert row.error_max == pytest.approx(3e-3, rel=1e-6)
     assert row.error_end == pytest.approx(2e-4, rel=1e-6)
     phi = [np.abs(FIVE_BAR.phi(q_tree)).max() for q_tree in off]
@@ -87,29 +87,33 @@ def test_errors_are_along_the_run_and_at_its_end(exact: Reference) -> None:
 
 
 @pytest.mark.parametrize("broken", ["stopped", "nan", "short"])
-def test_what_did_not_get_there_has_no_error(broken: str, exact: Reference) -> None:
+def test_incomplete_motion_has_no_error(broken: str, exact: Reference) -> None:
     values = exact.values[:5] if broken == "short" else exact.values.copy()
     if broken == "nan":
         values[-1, 0] = np.nan
-    row = judged(SHORT, "other", "s", motion(values, status="stopped" if broken == "stopped" else "done"), exact)
+    row = compare_with_reference(
+        SHORT_WORK, "other", "s", motion(values, status="stopped" if broken == "stopped" else "done"), exact
+    )
     assert row.error_max is None
     assert row.status != "done" or broken == "short"
 
 
-def test_a_repeated_run_is_the_same_run() -> None:
-    """What is measured, warm and from a loop that has run before, is what a user's run computes."""
+def test_repeated_run_gives_equal_results() -> None:
+    """A measured run, from a loop that has run before, gives the result of a user's run."""
     setting = Setting("reduced", "DOP853", 1e-6)
-    motion = ours.compute(SHORT, setting, 60.0)
-    run = simulate(SHORT.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6))
+    motion = ours.compute(SHORT_WORK, setting, 60.0)
+    run = simulate(SHORT_WORK.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6))
     assert np.array_equal(motion.q_tree, run.q_tree)
     assert np.array_equal(motion.v_tree, run.v_tree)
     assert (motion.steps, motion.rhs) == (run.stats["steps"], run.stats["rhs"])
     assert motion.wall_s > 0
 
 
-def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
+def test_other_programs_compute_the_same_motion(exact: Reference) -> None:
     setting = Setting("dae", "auto", 1e-8)
-    row = judged(SHORT, ours.PROGRAM, ours.name_of(setting), ours.compute(SHORT, setting, 60.0), exact)
+    row = compare_with_reference(
+        SHORT_WORK, ours.PROGRAM, ours.name_of(setting), ours.compute(SHORT_WORK, setting, 60.0), exact
+    )
     assert row.error_max is not None
     assert row.error_max < 1e-7
     assert row.energy_drift is not None
@@ -121,30 +125,32 @@ def test_ours_and_the_others_do_the_same_work(exact: Reference) -> None:
         "Pinocchio constraintDynamics": "K_p 10, dt 6.25e-05",
         "SUNDIALS IDA": "rtol 1e-05",
     }
-    for peer in (peer for peer in peers() if peer.name != LOOP):  # which has tests of its own
-        assert peer.missing(SHORT) is None
-        assert settings[peer.name] in set(peer.settings(SHORT, quick=False))
-        theirs = judged(SHORT, peer.name, "s", peer.compute(SHORT, settings[peer.name], 60.0), exact)
+    for peer in (peer for peer in peers() if peer.name != LOOP):  # the loop program has separate tests
+        assert peer.missing(SHORT_WORK) is None
+        assert settings[peer.name] in set(peer.settings(SHORT_WORK, quick=False))
+        theirs = compare_with_reference(
+            SHORT_WORK, peer.name, "s", peer.compute(SHORT_WORK, settings[peer.name], 60.0), exact
+        )
         assert theirs.error_max is not None
         assert theirs.error_max < 1e-3
         assert theirs.error_max > row.error_max
 
 
 @pytest.mark.parametrize("work", ["swing", "andrews", "bricard", "slider_crank"])
-def test_others_are_set_up_as_the_same_tree(work: str) -> None:
-    """Mass matrix and bias at the start: the least that makes a comparison one."""
+def test_other_programs_have_equal_mass_matrix_and_bias(work: str) -> None:
+    """Equal mass matrices and biases at the start are the precondition of a comparison."""
     for peer in (peer for peer in peers() if peer.name in ("MuJoCo", "Drake")):
-        assert peer.missing(EVERY[work]) is None
-        mass, bias = (float(x) for x in re.findall(r"to (\d\S*e[-+]\d+)", peer.check(EVERY[work])))
+        assert peer.missing(BY_KEY[work]) is None
+        mass, bias = (float(x) for x in re.findall(r"to (\d\S*e[-+]\d+)", peer.check(BY_KEY[work])))
         assert mass < 1e-9
         assert bias < 1e-9
 
 
-def test_every_formulation_is_measured_by_every_method() -> None:
-    scene = SHORT.load()
+def test_settings_combine_all_formulations_and_methods() -> None:
+    scene = SHORT_WORK.load()
     quick, full = (list(ours.settings(quick=how)) for how in (True, False))
-    for every in (quick, full):
-        assert len({ours.name_of(setting) for setting in every}) == len(every)
+    for settings in (quick, full):
+        assert len({ours.name_of(setting) for setting in settings}) == len(settings)
     assert len(quick) == 4 * len(ours.QUICK_TOLERANCES)
     assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.FEW))
     assert {setting.method for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
@@ -153,21 +159,21 @@ def test_every_formulation_is_measured_by_every_method() -> None:
         assert override_scene(scene, setting.overrides(scene))
 
 
-def test_a_setting_is_read_back_from_its_name() -> None:
+def test_setting_round_trips_through_its_name() -> None:
     for setting in ours.settings(quick=False):
         assert ours.setting_of(ours.name_of(setting)) == setting
 
 
-def test_a_reason_is_no_list_of_coordinates() -> None:
-    """The reduced model of squares in a row stops where they lie flat, and says near which coordinates."""
-    flat = replace(EVERY["n_four_bar_4"], t_end=2.0)
+def test_reason_of_stop_is_short() -> None:
+    """The reduced model of a row of squares stops where they lie flat; its message lists coordinates."""
+    flat = replace(BY_KEY["n_four_bar_4"], t_end=2.0)
     stopped = ours.compute(flat, Setting("reduced", "DOP853", 1e-6), 60.0)
     assert stopped.status == "stopped"
     assert not any(name in stopped.reason for name in flat.mechanism.coordinates)
 
 
-def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance() -> None:
-    rows = list(make.rows_of(SHORT, True, Memory(None), [], Budget(own=1e-6, peer=1e-6)))
+def test_tighter_tolerances_are_skipped_after_budget_is_exhausted() -> None:
+    rows = list(make.rows_of(SHORT_WORK, True, Memory(None), [], Budget(ours=1e-6, peer=1e-6)))
     statuses = [row.status for row in rows]
     families = len({ours.setting_of(row.setting).family for row in rows})
     assert statuses.count("stopped") == families
@@ -175,33 +181,35 @@ def test_what_used_up_its_budget_is_not_tried_with_a_tighter_tolerance() -> None
     assert all(row.error_max is None for row in rows)
 
 
-def test_a_run_that_would_take_too_long_is_refused_beforehand(exact: Reference) -> None:
+def test_run_over_budget_is_refused_in_advance(exact: Reference) -> None:
     mujoco = peers()[0]
-    refused = judged(SHORT, "MuJoCo", "s", mujoco.compute(SHORT, "RK4, solref 2 dt, dt 1e-06", 1e-3), exact)
+    refused = compare_with_reference(
+        SHORT_WORK, "MuJoCo", "s", mujoco.compute(SHORT_WORK, "RK4, solref 2 dt, dt 1e-06", 1e-3), exact
+    )
     assert refused.status == "refused"
     assert refused.error_max is None
 
 
-def test_others_say_why_they_are_missing() -> None:
-    said = {peer.name: peer.missing(EVERY["tracking_1e-04"]) for peer in peers()}
+def test_missing_programs_give_reason() -> None:
+    said = {peer.name: peer.missing(BY_KEY["tracking_1e-04"]) for peer in peers()}
     for name in set(said) - {"SUNDIALS IDA"}:
         assert said[name]
     assert said["SUNDIALS IDA"] is None
-    andrews = {peer.name: peer.missing(EVERY["andrews"]) for peer in peers() if peer.name != LOOP}
+    andrews = {peer.name: peer.missing(BY_KEY["andrews"]) for peer in peers() if peer.name != LOOP}
     assert andrews["Pinocchio constraintDynamics"]
 
 
 # --- the tables ---------------------------------------------------------------------------------------------------
 
 
-def test_a_stamp_depends_on_scene_and_version() -> None:
-    longer = Work("short", SHORT.says, SHORT.scene, 0.2)
-    assert work_stamp(SHORT, "1") == work_stamp(replace(SHORT), "1")
-    assert len({work_stamp(SHORT, "1"), work_stamp(SHORT, "2"), work_stamp(longer, "1")}) == 3
+def test_cache_key_depends_on_scene_and_version() -> None:
+    longer = Work("short", SHORT_WORK.says, SHORT_WORK.scene, 0.2)
+    assert work_stamp(SHORT_WORK, "1") == work_stamp(replace(SHORT_WORK), "1")
+    assert len({work_stamp(SHORT_WORK, "1"), work_stamp(SHORT_WORK, "2"), work_stamp(longer, "1")}) == 3
 
 
 class Nobody:
-    """A program that is not there."""
+    """A program that is not installed."""
 
     name = "Nobody"
     packaged = False
@@ -214,20 +222,20 @@ class Nobody:
 
 
 class Breaks:
-    """A program whose every run fails, and which counts them."""
+    """A program whose runs all fail; it counts them."""
 
     name = "Breaks"
     packaged = True
     runs = 0
 
     def __init__(self, version: str = "1") -> None:
-        self.own = version
+        self.version_ = version
 
     def missing(self, work: Work) -> None:
         return None
 
     def version(self) -> str:
-        return self.own
+        return self.version_
 
     def settings(self, work: Work, quick: bool) -> list[str]:
         return ["always"]
@@ -237,20 +245,22 @@ class Breaks:
         return motion_without_data("failed", "it fell, over a comma")
 
 
-def test_what_was_measured_is_not_measured_again(tmp_path: Path) -> None:
+def test_cached_measurements_are_reused(tmp_path: Path) -> None:
     memory, others = Memory(tmp_path, verbose=0), [Nobody(), Breaks()]
-    first = list(make.rows_of(SHORT, True, memory, others))
+    first = list(make.rows_of(SHORT_WORK, True, memory, others))
     assert {row.program for row in first} == {ours.PROGRAM, "Breaks"}
     assert (first[-1].status, first[-1].reason) == ("failed", "it fell, over a comma")
-    assert list(make.rows_of(SHORT, True, memory, others)) == first  # times and all
+    assert (
+        list(make.rows_of(SHORT_WORK, True, memory, others)) == first
+    )  # equal times show that the rows come from the cache
     assert others[1].runs == 1
     newer = Breaks("2")
-    list(make.rows_of(SHORT, True, memory, [newer]))
+    list(make.rows_of(SHORT_WORK, True, memory, [newer]))
     assert newer.runs == 1
 
 
-def test_a_page_is_made_from_the_tables_alone(tmp_path: Path) -> None:
-    """The committed tables' page is the committed page."""
+def test_page_is_reproduced_from_tables(tmp_path: Path) -> None:
+    """The committed tables reproduce the committed page."""
     for name in [*(f"{name}.csv.gz" for name in make.TABLES), "about.json"]:
         shutil.copy(DOCS / name, tmp_path)
     files = make.write(tmp_path)
@@ -260,27 +270,31 @@ def test_a_page_is_made_from_the_tables_alone(tmp_path: Path) -> None:
     assert figures == {path.name for path in DOCS.glob("*.png")}
 
 
-def test_a_folder_without_tables_has_no_page(tmp_path: Path) -> None:
+def test_report_without_tables_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        make.report(tmp_path, anew=False)
+        make.report(tmp_path, from_tables=True)
 
 
-def test_terms_written_out_are_paid_for_by_motion() -> None:
-    """What they save, per second of motion, has to make up for compiling; too large a tree says why it has none."""
-    found = written_out(SHORT, 1.5)
-    assert None not in (found.compile_s, found.written_s, found.general_s, found.pays_s)
-    assert found.written_s < found.general_s
-    assert found.pays_s * (found.general_s - found.written_s) == pytest.approx(found.compile_s * SHORT.t_end)
-    large = written_out(replace(EVERY["n_four_bar_40"], overrides={"mechanism.N": 80}), 1.5)
+def test_compiled_terms_pay_after_stated_length_of_motion() -> None:
+    """The time saved per second of motion repays compiling after `pays_s`; a too large tree gives a reason."""
+    cost = compiled_terms_cost(SHORT_WORK, 1.5)
+    assert None not in (cost.compile_s, cost.compiled_run_s, cost.pinocchio_run_s, cost.pays_s)
+    assert cost.compiled_run_s < cost.pinocchio_run_s
+    assert cost.pays_s * (cost.pinocchio_run_s - cost.compiled_run_s) == pytest.approx(
+        cost.compile_s * SHORT_WORK.t_end
+    )
+    large = compiled_terms_cost(replace(BY_KEY["n_four_bar_40"], overrides={"mechanism.N": 80}), 1.5)
     assert "terms are compiled for trees of up to 130" in large.refused
     assert large.compile_s is None
 
 
-def test_a_page_says_what_compiling_costs(tmp_path: Path) -> None:
+def test_page_has_table_of_compile_costs(tmp_path: Path) -> None:
     for name in [*(f"{name}.csv.gz" for name in make.TABLES), "about.json"]:
         shutil.copy(DOCS / name, tmp_path)
     works = pd.read_csv(tmp_path / "works.csv.gz")
-    costs = pd.DataFrame([{"compile_s": 0.8, "written_s": 1e-3, "general_s": 5e-3, "pays_s": 400.0}] * len(works))
+    costs = pd.DataFrame(
+        [{"compile_s": 0.8, "compiled_run_s": 1e-3, "pinocchio_run_s": 5e-3, "pays_s": 400.0}] * len(works)
+    )
     costs.loc[1] = None
     works = works.drop(columns=costs.columns, errors="ignore").join(costs).assign(refused="")
     works.loc[1, "refused"] = "81 coordinates"

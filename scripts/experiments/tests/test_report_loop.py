@@ -1,4 +1,4 @@
-"""The strongest peer, a C++ loop that is compiled on demand: what it computes, and what is said where it cannot be."""
+"""The C++ loop on Pinocchio's constraintDynamics: its results, and messages if it cannot be compiled."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ TIGHT = "K_p 0, mu 1e-08, iterations 3, tolerance 1e-12"
 
 
 @pytest.fixture
-def anew() -> Iterator[None]:
-    """No program yet, before the test and after it."""
+def empty_program_cache() -> Iterator[None]:
+    """Clear the cache of the compiled program before and after the test."""
     kept = compiled.program
     compiled.program.cache_clear()
     yield
@@ -31,8 +31,8 @@ def anew() -> Iterator[None]:
 
 @compiles
 @pytest.mark.parametrize("key", ["andrews", "bricard", "delta", "two_ur5"])
-def test_it_is_the_same_mechanism(key: str) -> None:
-    """Springs, a hinge of redundant rows, balls, and a free root: the sorts of closure and state there are."""
+def test_loop_program_has_the_same_mechanism(key: str) -> None:
+    """Covers springs, a hinge with redundant rows, spherical loops, and a free root."""
     work = next(work for work in WORKS if work.key == key)
     assert LOOP.missing(work) is None
     mass, bias, energy, acceleration = (float(x) for x in re.findall(r"(\d\S*e[-+]\d+)", LOOP.check(work)))
@@ -43,8 +43,8 @@ def test_it_is_the_same_mechanism(key: str) -> None:
 
 
 @compiles
-def test_it_follows_the_closed_form() -> None:
-    """Half a second of the pendulum that a square's angle is, by quadrature of its energy in numpy alone."""
+def test_loop_program_follows_closed_form() -> None:
+    """Half a second of a square's angle, a pendulum, by quadrature of its energy in numpy."""
     from scipy.integrate import quad
     from scipy.optimize import brentq
 
@@ -65,7 +65,7 @@ def test_it_follows_the_closed_form() -> None:
 
 
 @compiles
-def test_its_springs_and_its_free_root_move_as_ours() -> None:
+def test_loop_program_supports_springs_and_free_roots() -> None:
     from ckc_pin.run.simulate import simulate
 
     for key, t_end in (("andrews", 0.01), ("two_ur5", 0.2)):
@@ -78,21 +78,21 @@ def test_its_springs_and_its_free_root_move_as_ours() -> None:
 
 
 @compiles
-def test_a_run_over_its_budget_is_ended() -> None:
+def test_run_over_budget_is_terminated() -> None:
     motion = LOOP.compute(next(work for work in WORKS if work.key == "n_four_bar_40"), TIGHT, 0.01)
     assert motion.status == "refused"
     assert len(motion.q_tree) == 0
 
 
-@pytest.mark.usefixtures("anew")
-def test_without_a_compiler_one_line_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("empty_program_cache")
+def test_missing_compiler_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CXX", raising=False)
     assert LOOP.missing(ONE_SQUARE) == "no C++ compiler was found"
 
 
-@pytest.mark.usefixtures("anew")
-def test_what_the_compiler_says_is_handed_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("empty_program_cache")
+def test_compiler_error_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     compiler = tmp_path / "c++"
     compiler.write_text(
         f"#!{sys.executable}\nimport sys\nsys.exit('a note\\nloop.cpp:3: error: no such   header\\nmore')\n"

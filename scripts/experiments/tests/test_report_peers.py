@@ -1,4 +1,4 @@
-"""Other programs on motions that need more than the five-bar's swing: slides, many turns, springs, forces, bushings."""
+"""Other programs on slides, many turns, springs, forces and bushings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scripts.experiments.benchmark.peers import Peer, peers
 from scripts.experiments.benchmark.peers.exudyn_plane import in_plane
 from scripts.experiments.benchmark.work import WORKS, Work
 
-EVERY = {work.key: work for work in WORKS}
+BY_KEY = {work.key: work for work in WORKS}
 EXUDYN = next(peer for peer in peers() if peer.name == "Exudyn")
 DRAKE = next(peer for peer in peers() if peer.name == "Drake")
 MUJOCO = next(peer for peer in peers() if peer.name == "MuJoCo")
@@ -31,7 +31,7 @@ SPRING = Work("spring", "Andrews' squeezer, 2 ms", "andrews", 0.002)
         (MUJOCO, SPRING, "RK4, solref 4 dt, dt 1e-05", 1e-3),
     ],
 )
-def test_it_moves_as_ours(peer: Peer, work: Work, setting: str, allowed: float) -> None:
+def test_program_computes_the_same_motion(peer: Peer, work: Work, setting: str, allowed: float) -> None:
     run = simulate(work.load(formulation="dae", solver__rtol=1e-10))
     motion = peer.compute(work, setting, 60.0)
     assert motion.status == "done", motion.reason
@@ -39,7 +39,7 @@ def test_it_moves_as_ours(peer: Peer, work: Work, setting: str, allowed: float) 
     assert np.abs(motion.v_tree - run.v_tree).max() < allowed * max(1.0, float(np.abs(run.v_tree).max()))
 
 
-def test_the_state_read_back_is_the_one_put_in() -> None:
+def test_state_round_trips_through_program() -> None:
     for work in (TURNS, SPRING):
         assert in_plane(work)
         motion = EXUDYN.compute(work, f"GeneralizedAlpha, spectral radius 0.9, dt {work.t_end / 1000}", 60.0)
@@ -49,5 +49,5 @@ def test_the_state_read_back_is_the_one_put_in() -> None:
 
 
 @pytest.mark.parametrize("key", ["bricard", "delta", "two_ur5"])
-def test_what_moves_in_space_is_not_taken_for_planar(key: str) -> None:
-    assert not in_plane(EVERY[key])
+def test_spatial_mechanisms_are_not_planar(key: str) -> None:
+    assert not in_plane(BY_KEY[key])

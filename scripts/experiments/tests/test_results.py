@@ -13,7 +13,7 @@ from tests.conftest import assert_close
 
 
 @pytest.mark.parametrize(("model", "rows"), [(FIVE_BAR, (1, 2, 4, 3)), (AS_PRINTED, (1, 2, 3, 4))])
-def test_printed_terms_are_the_appendix(model: FiveBar, rows: tuple[int, int, int, int]) -> None:
+def test_printed_terms_equal_appendix_in_numpy(model: FiveBar, rows: tuple[int, int, int, int]) -> None:
     printed, random = Printed(rows), np.random.default_rng(3)
     for _ in range(20):
         q, v = random.uniform(-3, 3, 4), random.uniform(-3, 3, 4)
@@ -25,13 +25,13 @@ def test_printed_terms_are_the_appendix(model: FiveBar, rows: tuple[int, int, in
         assert_close(square[0, 1], -a * (v[1] ** 2 - v[1]), 1e-15)
 
 
-def test_shipped_mechanisms_have_the_appendix_terms() -> None:
+def test_shipped_mechanisms_match_appendix() -> None:
     for name, rows in (("five_bar", (1, 2, 4, 3)), ("five_bar_as_printed", (1, 2, 3, 4))):
         assert max(appendix_difference(name, rows)) < 1e-12
-    assert appendix_difference("five_bar", (1, 2, 3, 4))[0] > 1e-2  # the other reading is another mechanism
+    assert appendix_difference("five_bar", (1, 2, 3, 4))[0] > 1e-2  # the other assignment is another mechanism
 
 
-def test_plants_are_scaled() -> None:
+def test_plant_scales_masses_and_gravity() -> None:
     heavy, light = FIVE_BAR.heavier(1.2, 1.2), plant(gravity=0.0)
     q, v = np.array([0.2, -0.4, 1.0, 0.3]), np.zeros(4)
     scaled = plant(mass=1.2)
@@ -40,23 +40,23 @@ def test_plants_are_scaled() -> None:
     assert_close(Terms(light, light.kinematics(q), v).h_tree, 0.0, 1e-15)
 
 
-def test_tracking_error_is_the_same_for_every_plant_that_the_controller_knows() -> None:
-    """Eq. 17: after r has died out the error falls like e^-t; r's share is the integral of e^s r, of order D / K_D."""
+def test_tracking_error_is_independent_of_plant_with_exact_model() -> None:
+    """By eq. 17 the error decays like e^-t after r has decayed; r adds the integral of e^s r, of order D / K_D."""
     start = FIVE_BAR.equilibrium()[[0, 2]]
-    known = [error_law("", own, rtol=1e-6) for own in (plant(), plant(gravity=0.0), plant(mass=2.0))]
-    for law in known:
+    laws = [error_law("", mechanism, rtol=1e-6) for mechanism in (plant(), plant(gravity=0.0), plant(mass=2.0))]
+    for law in laws:
         assert_close(law.error, np.exp(-9.5) * start, 1e-2, relative=True)
-    assert_close(known[1].error, known[0].error, 1e-9)
-    assert_close(known[2].error, known[0].error, 1e-6)
-    assert known[1].steady_u < 0.2 < known[0].steady_u < known[2].steady_u
+    assert_close(laws[1].error, laws[0].error, 1e-9)
+    assert_close(laws[2].error, laws[0].error, 1e-6)
+    assert laws[1].steady_u < 0.2 < laws[0].steady_u < laws[2].steady_u
 
 
-def test_tracking_error_tells_a_wrong_model() -> None:
+def test_tracking_error_depends_on_model_error() -> None:
     law = error_law("", plant(mass=1.2), plant(), rtol=1e-6)
     assert np.abs(law.error).min() > 1e-2
 
 
-def test_known_numbers_of_the_default_run() -> None:
+def test_default_run_has_published_numbers() -> None:
     law = error_law("", plant())
     assert_close(law.error, [-1.0775e-4, -1.281e-4], 1e-8)
     assert_close(law.steady_u, 1.35, 0.01)

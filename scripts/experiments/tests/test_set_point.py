@@ -17,7 +17,7 @@ from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import derivative, record
 from scripts.experiments.paper.set_point_experiments import (
     DENSE,
-    NEAR,
+    NEAR_START,
     SCENE,
     Case,
     along_run,
@@ -30,7 +30,7 @@ from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.conftest import Pair, assert_close
 
 
-def test_gradient_is_the_derivative_of_the_appendix_h(five_bar: Pair) -> None:
+def test_gradient_equals_differences_of_appendix_h(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     error, asymmetry, used = gradient_error(mechanism, 30)
     assert used > 15
@@ -41,32 +41,32 @@ def test_gradient_is_the_derivative_of_the_appendix_h(five_bar: Pair) -> None:
 # --- eq. 15 ------------------------------------------------------------------------------------------------------
 
 
-def test_one_solution_where_the_gain_condition_holds() -> None:
-    case = load_case(NEAR)
+def test_certified_case_has_one_equilibrium() -> None:
+    case = load_case(NEAR_START)
     (only,) = equilibria_of(case, 10, 60)
     assert only.kind == "minimum"
     assert_close(only.q, case.controller.q_d, 1e-9)
 
 
-def test_low_gains_have_other_solutions_and_runs_end_there() -> None:
+def test_low_gains_have_further_equilibria_that_attract_runs() -> None:
     low = {"controller.K_P": 0.5}
     case = load_case(low)
-    found = equilibria_of(case, 12, 60)
+    solutions = equilibria_of(case, 12, 60)
     q_d, h_d = case.controller.q_d, FIVE_BAR.h(FIVE_BAR.sigma(case.controller.q_d))
-    for x in found:
+    for x in solutions:
         h = FIVE_BAR.h(FIVE_BAR.sigma(x.q))
         assert_close(h - h_d, 0.5 * (q_d - x.q), 1e-9)
         hessian = 0.5 * np.eye(2) + five_bar_gradient(x.q, 1e-4)
         assert (x.kind == "minimum") is bool(np.all(np.linalg.eigvalsh(hessian) > 0))
         assert_close(x.height, five_bar_U(case.controller, x.q), 1e-10)
-    assert {x.kind for x in found} == {"minimum", "saddle"}
+    assert {x.kind for x in solutions} == {"minimum", "saddle"}
     run = simulate(SCENE, {**low, "t_end": 60.0})
     end = run.q_tree[-1, [0, 2]]
     assert np.abs(end - q_d).max() > 0.5
-    assert min(np.abs(end - x.q).max() for x in found if x.kind == "minimum") < 1e-6
+    assert min(np.abs(end - x.q).max() for x in solutions if x.kind == "minimum") < 1e-6
 
 
-def test_a_scene_without_set_point_control_is_refused() -> None:
+def test_scene_without_set_point_controller_is_rejected() -> None:
     with pytest.raises(InputError, match="set-point"):
         load_case(scene="five_bar/tracking")
 
@@ -75,14 +75,14 @@ def test_a_scene_without_set_point_control_is_refused() -> None:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_rate_of_the_lyapunov_function(formulation: str) -> None:
-    run, found = along_run({**DENSE, "formulation": formulation, "t_end": 0.3, "solver.output_dt": 1e-3})
-    assert found.monotone
-    assert found.mismatch < 1e-6
-    assert_close(found.value, [five_bar_V(run.q_tree[k], run.v_tree[k]) for k in range(len(run.t))], 1e-10)
-    wrong = record(run, lambda k: 1.1 * float(found.predicted[k]))
+def test_lyapunov_rate_equals_formula(formulation: str) -> None:
+    run, recorded = along_run({**DENSE, "formulation": formulation, "t_end": 0.3, "solver.output_dt": 1e-3})
+    assert recorded.monotone
+    assert recorded.mismatch < 1e-6
+    assert_close(recorded.value, [five_bar_V(run.q_tree[k], run.v_tree[k]) for k in range(len(run.t))], 1e-10)
+    wrong = record(run, lambda k: 1.1 * float(recorded.predicted[k]))
     assert wrong.mismatch > 0.05
-    rising = record(replace(run, lyapunov=found.value[::-1].copy()), lambda k: 1.0)
+    rising = record(replace(run, lyapunov=recorded.value[::-1].copy()), lambda k: 1.0)
     assert not rising.monotone
 
 
@@ -95,7 +95,7 @@ def five_bar_V(q_tree: Array, v_tree: Array) -> float:
     )
 
 
-def test_derivative_of_samples() -> None:
+def test_spline_derivative_of_samples_is_accurate() -> None:
     t = np.linspace(0, 1, 101)
     assert_close(derivative(t, np.exp(-3 * t)), -3 * np.exp(-3 * t), 1e-9)
 
@@ -113,30 +113,35 @@ def certified() -> dict[str, tuple[Case, Certificate]]:
 
 
 def complete(claim: Claim, figures: Path) -> str:
-    """Return the verdict of a claim whose table and figures are whole."""
+    """Check that a claim's table and figures are complete, and return its verdict."""
     assert all((figures / name).stat().st_size > 5_000 for name in claim.figures)
     assert claim.table is not None
     assert all(len(row) == len(claim.table[0]) for row in claim.table[1])
     return claim.verdict
 
 
-def test_verdict_on_the_gain_condition(certified: dict[str, tuple[Case, Certificate]], tmp_path: Path) -> None:
-    case, own = certified[CHOSEN[0]]
-    run, found = along_run({**DENSE, "formulation": "reduced", "t_end": 0.3})
-    assert complete(set_point.gain_claim(case, own, certified, run, tmp_path), tmp_path) == "holds with a condition"
-    assert complete(set_point.lyapunov_claim({"reduced": found}, tmp_path), tmp_path) == "holds"
-    rising = record(replace(run, lyapunov=found.value[::-1].copy()), lambda k: 1.0)
+def test_gain_condition_verdict_follows_certificate(
+    certified: dict[str, tuple[Case, Certificate]], tmp_path: Path
+) -> None:
+    case, certificate = certified[CHOSEN[0]]
+    run, recorded = along_run({**DENSE, "formulation": "reduced", "t_end": 0.3})
+    assert (
+        complete(set_point.gain_claim(case, certificate, certified, run, tmp_path), tmp_path)
+        == "holds with a condition"
+    )
+    assert complete(set_point.lyapunov_claim({"reduced": recorded}, tmp_path), tmp_path) == "holds"
+    rising = record(replace(run, lyapunov=recorded.value[::-1].copy()), lambda k: 1.0)
     assert complete(set_point.lyapunov_claim({"reduced": rising}, tmp_path), tmp_path) == "does not hold"
 
 
-def test_verdict_on_uniqueness(certified: dict[str, tuple[Case, Certificate]], tmp_path: Path) -> None:
+def test_uniqueness_verdict_follows_solutions(certified: dict[str, tuple[Case, Certificate]], tmp_path: Path) -> None:
     solutions = {name: equilibria_of(case, 10, 30) for name, (case, _) in certified.items()}
     assert complete(set_point.uniqueness_claim(certified, solutions), tmp_path) == "holds"
     two = {**solutions, CHOSEN[1]: solutions[CHOSEN[1]] * 2}  # where the gain condition is certified
     assert complete(set_point.uniqueness_claim(certified, two), tmp_path) == "does not hold"
 
 
-def test_verdict_on_the_bound(five_bar: Pair, tmp_path: Path) -> None:
+def test_bound_verdict_follows_growth(five_bar: Pair, tmp_path: Path) -> None:
     mechanism, case = five_bar[0], load_case()
     step = chart_step(mechanism, 16)
     explored = explore_branch(mechanism, mechanism.assembled, 16)

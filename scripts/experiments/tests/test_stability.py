@@ -1,4 +1,4 @@
-"""The stability suite: what it compares with, how it judges, and some of its cells."""
+"""The stability suite: references, verdicts, and some of its cells."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import pytest
 from ckc_pin import Run
 from ckc_pin.kinematics import load
 from scripts.experiments.stability import equations
-from scripts.experiments.stability.cases import EVERY, GROUPS, PAPER, SWING
+from scripts.experiments.stability.cases import GROUPS, MODELS, PAPER, SWING
 from scripts.experiments.stability.cell import Case, Cell, How, run_case
 from scripts.experiments.stability.equations import Reduced, free_motion, to_absolute
-from scripts.experiments.stability.long_runs import LONG, long_run
+from scripts.experiments.stability.long_runs import LONG_RUN_SETTINGS, long_run
 from scripts.experiments.stability.page import TITLES, as_frame, page, satisfied, save
 from scripts.experiments.stability.planar import JointSpring, LineSpring, Planar
 from scripts.experiments.stability.reference import ByHand, gap
@@ -31,21 +31,21 @@ def in_numpy(p: Planar) -> FiveBar:
 
 
 def states(model: FiveBar, count: int = 10) -> list[tuple[Array, Array]]:
-    """Closed configurations near the equilibrium and rates of all joints that keep them so."""
+    """Return closed configurations near the equilibrium with admissible rates."""
     random = np.random.default_rng(0)
-    found = []
+    pairs = []
     for _ in range(count):
         q_tree = model.sigma(np.array([-1.4, -1.7]) + random.uniform(-0.4, 0.4, 2))
-        found.append((q_tree, model.rho(q_tree) @ random.normal(size=2)))
-    return found
+        pairs.append((q_tree, model.rho(q_tree) @ random.normal(size=2)))
+    return pairs
 
 
-# --- what is compared with -------------------------------------------------------------------------
+# --- references -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("p", [PAPER, UNEVEN], ids=["paper", "uneven"])
-def test_free_motion_by_hand_is_eq_1(p: Planar) -> None:
-    """The links' accelerations, by the numpy five-bar with its multipliers."""
+def test_free_motion_satisfies_eq_1(p: Planar) -> None:
+    """Compare the links' accelerations with the numpy five-bar and its multipliers."""
     model = in_numpy(p)
     for q_tree, v_tree in states(model):
         theirs, _ = model.acceleration_and_multipliers(q_tree, v_tree, np.zeros(2))
@@ -65,7 +65,7 @@ CONTROLS = {
 
 
 @pytest.mark.parametrize("control", CONTROLS)
-def test_closed_loops_by_hand_are_eq_6(control: str) -> None:
+def test_controlled_motion_satisfies_eq_6(control: str) -> None:
     by_hand, numpy_control = CONTROLS[control]
     model = in_numpy(UNEVEN)
     u: Controller = numpy_control(model)
@@ -78,8 +78,8 @@ def test_closed_loops_by_hand_are_eq_6(control: str) -> None:
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_springs_by_hand_do_the_work_they_should(damping: float) -> None:
-    """dE/dt, the springs' energy included, is what the dampers take."""
+def test_spring_power_equals_damping_loss(damping: float) -> None:
+    """dE/dt, including the springs' energy, equals the power of the dampers."""
     line, joint = LineSpring(50.0, damping, 0.2, 0.1, 0.15), JointSpring(2.0, damping, 0.5)
     p, model = replace(PAPER, line=line, joint=joint), in_numpy(PAPER)
 
@@ -107,62 +107,62 @@ def test_errors_are_relative_to_the_scale_of_the_solution() -> None:
     assert gap(np.array([np.nan]), np.array([0.0])) == np.inf
 
 
-def test_the_files_that_are_written_are_the_shipped_five_bar(tmp_path: Path) -> None:
+def test_written_files_equal_shipped_five_bar(tmp_path: Path) -> None:
     PAPER.write(tmp_path)
     ours, shipped = load(tmp_path / "mechanism.toml"), load("five_bar")
     assert_close(ours.q_tree, shipped.q_tree, 1e-13)
     assert ours.coordinates == shipped.coordinates
 
 
-# --- how it judges ---------------------------------------------------------------------------------
+# --- verdicts ---------------------------------------------------------------------------------
 
-SHORT = {"initial.q": {"theta_1": SWING[0], "theta_3": SWING[1]}, "t_end": 0.2, "solver.output_dt": 0.1}
+SHORT_SWING = {"initial.q": {"theta_1": SWING[0], "theta_3": SWING[1]}, "t_end": 0.2, "solver.output_dt": 0.1}
 
 
-def judge(reference: ByHand, how: How = EVERY[2], **overrides: object) -> Cell:
+def judge(reference: ByHand, how: How = MODELS[2], **overrides: object) -> Cell:
     case = Case(
         "method",
         "short",
         "five_bar",
-        {**SHORT, **{k.replace("__", "."): v for k, v in overrides.items()}},
+        {**SHORT_SWING, **{k.replace("__", "."): v for k, v in overrides.items()}},
         reference,
         (how,),
     )
     return run_case(case)[0]
 
 
-def test_a_right_run_is_within() -> None:
+def test_accurate_run_is_within() -> None:
     cell = judge(ByHand(PAPER))
     assert (cell.verdict, cell.t) == ("within", 0.2)
     assert cell.error <= 1e-7 < cell.allowed
     assert cell.uncertainty <= 1e-10
 
 
-def test_a_wrong_run_has_failed() -> None:
-    """A link a hundredth heavier in the reference than in the run."""
+def test_inaccurate_run_has_failed() -> None:
+    """A link of the reference is 1 % heavier than in the run."""
     cell = judge(ByHand(PAPER.heavier((1.0, 1.01, 1.0, 1.0))))
     assert cell.verdict == "FAILED"
     assert cell.allowed < cell.error < 1e-2
 
 
 class Open(ByHand):
-    """A reference that finds the loops a millimetre open."""
+    """A reference that reports |phi| = 1 mm."""
 
     def phi(self, run: Run) -> float:
         return 1e-3
 
 
-def test_loops_that_are_not_closed_have_failed() -> None:
+def test_open_loops_have_failed() -> None:
     assert judge(Open(PAPER)).verdict == "FAILED"
 
 
-def test_a_budget_stops_with_a_reason() -> None:
+def test_exhausted_budget_gives_reason() -> None:
     cell = judge(ByHand(PAPER), solver__max_rhs=50)
     assert cell.verdict == "stopped"
     assert "max_rhs = 50" in cell.message
 
 
-def test_a_case_that_cannot_be_run_has_failed() -> None:
+def test_case_that_raises_has_failed() -> None:
     cell = judge(ByHand(PAPER), solver__no_such_key=1)
     assert cell.verdict == "FAILED"
     assert "no_such_key" in cell.message
@@ -176,14 +176,14 @@ def some_cells() -> list[Cell]:
     return [*within, cell("stopped", t=0.5, message="why it stopped")]
 
 
-def test_nine_in_ten_and_no_failure_are_asked_for() -> None:
+def test_satisfied_requires_nine_in_ten_and_no_failure() -> None:
     cells = some_cells()
     assert satisfied(as_frame(cells))
     assert not satisfied(as_frame(cells[1:]))
     assert not satisfied(as_frame([*cells, *cells, replace(cells[0], verdict="FAILED")]))
 
 
-def test_the_table_comes_back_as_it_was_measured(tmp_path: Path) -> None:
+def test_table_round_trips_through_file(tmp_path: Path) -> None:
     cells = as_frame(some_cells())
     save(cells, tmp_path / "t.csv.gz")
     back = pd.read_csv(tmp_path / "t.csv.gz", keep_default_na=True)
@@ -193,32 +193,32 @@ def test_the_table_comes_back_as_it_was_measured(tmp_path: Path) -> None:
     assert back.message.dropna().tolist() == ["why it stopped"]
 
 
-def test_the_page_has_a_row_a_cell_that_stopped() -> None:
+def test_page_lists_stopped_cells() -> None:
     cells = some_cells()
-    own = [replace(cell, case=f"case {k}|") for k, cell in enumerate(cells)]
-    rows = [line for line in page(as_frame(own), []).splitlines() if line.startswith("| case ")]
-    assert len(rows) == len(own) + 1 + 1  # a table with a header, and why one stopped
+    renamed = [replace(cell, case=f"case {k}|") for k, cell in enumerate(cells)]
+    rows = [line for line in page(as_frame(renamed), []).splitlines() if line.startswith("| case ")]
+    assert len(rows) == len(renamed) + 1 + 1  # a table with a header, and why one stopped
     assert all(row.replace("\\|", "").count("|") in (3, 4) for row in rows)
 
 
-# --- its cells -------------------------------------------------------------------------------------
+# --- cells -------------------------------------------------------------------------------------
 
 
-def test_every_case_has_a_name_of_its_own_and_every_group_a_title() -> None:
+def test_case_names_are_unique_and_groups_have_titles() -> None:
     names = [(case.group, case.name) for cases in GROUPS.values() for case in cases()]
     assert len(set(names)) == len(names)
     assert {group for group, _ in names} == set(GROUPS) == set(TITLES)
 
 
-def test_the_committed_table_is_of_these_cases_and_satisfied() -> None:
+def test_committed_table_has_all_cases_and_is_satisfied() -> None:
     table = pd.read_csv(DOCS / "stability.csv.gz")
-    found = list(zip(table.group, table.case, table.formulation, table.method.str.partition(":")[0], strict=True))
+    committed = list(zip(table.group, table.case, table.formulation, table.method.str.partition(":")[0], strict=True))
     cells = [(c.group, c.name, how.label, how.method) for cases in GROUPS.values() for c in cases() for how in c.how]
-    assert found == cells
+    assert committed == cells
     assert satisfied(table)
 
 
-# extremes, by group: cases and the formulations that run
+# extreme cases by group, and the formulations to run
 THINNED = {
     "epsilon": ({"1e-01, w(0) = (0.01, -0.006)", "1e-06, w(0) large", "1e-12, w(0) large"}, "spf"),
     "mass": ({"link 2 x 1e+06", "link 2 x 1e-08"}, "reduced"),
@@ -246,23 +246,23 @@ def test_cells_are_within_tolerance(group: str) -> None:
         assert cell.uncertainty <= 0.1 * cell.allowed
 
 
-def test_a_start_that_is_singular_to_rounding_is_refused() -> None:
+def test_singular_start_is_rejected() -> None:
     case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-12 away")
     cells = run_case(case)
     assert {cell.verdict for cell in cells} == {"stopped"}
     assert all("start elsewhere" in cell.message for cell in cells)
 
 
-def test_a_bad_q_is_left_before_the_first_step() -> None:
+def test_chart_is_changed_before_first_step() -> None:
     case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-04 away")
-    assert run_case(replace(case, overrides={**case.overrides, "solver.max_rhs": 1}, how=EVERY[:1]))[0].switches == 1
+    assert run_case(replace(case, overrides={**case.overrides, "solver.max_rhs": 1}, how=MODELS[:1]))[0].switches == 1
 
 
 # --- long runs -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "formulation", "overrides"), LONG[2:], ids=["swing", "across type 2"])
-def test_part_of_a_long_run(name: str, formulation: str, overrides: dict[str, object]) -> None:
+@pytest.mark.parametrize(("name", "formulation", "overrides"), LONG_RUN_SETTINGS[2:], ids=["swing", "across type 2"])
+def test_tenth_of_long_run_has_tenth_of_drift(name: str, formulation: str, overrides: dict[str, object]) -> None:
     """A tenth of the time, a tenth of the drift."""
     run = long_run(name, formulation, overrides, 100.0)
     assert run.outcome == "done"

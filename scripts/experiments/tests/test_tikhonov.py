@@ -1,4 +1,4 @@
-"""The study of epsilon against the five-bar of the appendix in numpy, which integrates eq. 8 and eq. 1 itself."""
+"""The study of epsilon against the appendix's five-bar in numpy, with integrations of eqs. 8 and 1."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def problems() -> dict[str, Problem]:
     return {name: five_bar_problem(moving) for name, moving in STARTS.items()}
 
 
-# --- the numpy five-bar on its own terms -------------------------------------------------------------------------
+# --- the numpy five-bar -------------------------------------------------------------------------
 
 
 def start() -> Array:
@@ -40,7 +40,7 @@ def start() -> Array:
 
 
 def on_w(q_tree: Array, w: Array) -> Array:
-    """z corrected by Newton until phi = w."""
+    """Return q_tree with z corrected by Newton to phi = w."""
     q_tree = q_tree.copy()
     for _ in range(20):
         q_tree[Z] -= np.linalg.solve(FIVE_BAR.phi_z(q_tree), FIVE_BAR.phi(q_tree) - w)
@@ -49,7 +49,7 @@ def on_w(q_tree: Array, w: Array) -> Array:
 
 
 def spf_end(q_dot: Array, epsilon: float, convention: str) -> Array:
-    """(q', q_dot) at t = 1 by eq. 8 as printed, in (q', q_dot)."""
+    """Return (q', q_dot) at t = 1 by eq. 8 as printed, integrated in (q', q_dot)."""
 
     def rate(t: float, y: Array) -> Array:
         q_tree, q_dot = y[:4], y[4:]
@@ -65,7 +65,7 @@ def spf_end(q_dot: Array, epsilon: float, convention: str) -> Array:
 
 
 def dae_end(q_dot: Array) -> Array:
-    """(q', q_dot) at t = 1 by eq. 1 with multipliers."""
+    """Return (q', q_dot) at t = 1 by eq. 1 with multipliers."""
 
     def rate(t: float, y: Array) -> Array:
         q_tree, v_tree = y[:4], y[4:]
@@ -78,14 +78,14 @@ def dae_end(q_dot: Array) -> Array:
 
 @pytest.mark.parametrize("convention", ["rho", "actual"])
 @pytest.mark.parametrize("name", STARTS)
-def test_difference_is_what_the_numpy_five_bar_finds(problems: dict[str, Problem], name: str, convention: str) -> None:
+def test_difference_equals_numpy_five_bar(problems: dict[str, Problem], name: str, convention: str) -> None:
     off = spf_end(Q_DOT[name], 1e-2, convention) - dae_end(Q_DOT[name])
-    found = converge(problems[name], W0, (1e-2,), convention)  # type: ignore[arg-type]
-    assert_close(found.x[0], np.abs(off[[*Q, 4, 5]]).max(), 2e-9)
-    assert_close(found.z[0], np.abs(off[Z]).max(), 2e-9)
+    study = converge(problems[name], W0, (1e-2,), convention)  # type: ignore[arg-type]
+    assert_close(study.x[0], np.abs(off[[*Q, 4, 5]]).max(), 2e-9)
+    assert_close(study.z[0], np.abs(off[Z]).max(), 2e-9)
 
 
-def test_numpy_and_package_start_alike(problems: dict[str, Problem]) -> None:
+def test_numpy_and_package_have_equal_starts(problems: dict[str, Problem]) -> None:
     problem = problems["moving"]
     assert_close(problem.at.q_tree, start(), 1e-12)
     assert_close(on_level(problem.mechanism, problem.at, W0).q_tree, on_w(start(), W0), 1e-12)
@@ -93,18 +93,18 @@ def test_numpy_and_package_start_alike(problems: dict[str, Problem]) -> None:
 
 # --- the order ---------------------------------------------------------------------------------------------------
 
-# Measured before this study was written, with the numpy five-bar (two or three digits).
-KNOWN = {"rest": {1e-4: 9.12e-5, 1e-5: 9.12e-6}, "moving": {1e-4: 1.83e-5, 1e-5: 1.77e-6}}
+# Measured with the numpy five-bar before this study was written (two or three digits).
+NUMPY_DIFFERENCES = {"rest": {1e-4: 9.12e-5, 1e-5: 9.12e-6}, "moving": {1e-4: 1.83e-5, 1e-5: 1.77e-6}}
 
 
 @pytest.mark.parametrize("name", STARTS)
 def test_order_is_one_with_rho(problems: dict[str, Problem], name: str) -> None:
-    found = converge(problems[name], W0, (1e-4, 1e-5, 1e-6))
-    assert found.resolved
-    assert_close(found.z_orders, [1.0, 1.0], 0.05)
-    assert_close(found.orders, [1.0, 1.0], 0.05)
-    for epsilon, x in KNOWN[name].items():
-        assert_close(found.x[found.epsilons == epsilon], x, 0.005, relative=True)
+    study = converge(problems[name], W0, (1e-4, 1e-5, 1e-6))
+    assert study.resolved
+    assert_close(study.z_orders, [1.0, 1.0], 0.05)
+    assert_close(study.orders, [1.0, 1.0], 0.05)
+    for epsilon, x in NUMPY_DIFFERENCES[name].items():
+        assert_close(study.x[study.epsilons == epsilon], x, 0.005, relative=True)
 
 
 def test_actual_velocity_converges_from_rest_and_not_from_a_moving_start(problems: dict[str, Problem]) -> None:
@@ -118,12 +118,12 @@ def test_actual_velocity_converges_from_rest_and_not_from_a_moving_start(problem
 def test_actual_velocity_approaches_the_dae_behind_the_layer(problems: dict[str, Problem]) -> None:
     moving = problems["moving"]
     behind = problem_after_layer(moving, W0)
-    found = converge(moving, W0, (1e-5, 1e-6), "actual", reference=behind)
-    assert_close(found.orders, [1.0], 0.05)
+    study = converge(moving, W0, (1e-5, 1e-6), "actual", reference=behind)
+    assert_close(study.orders, [1.0], 0.05)
 
 
-def test_layer_turns_q_dot_as_in_numpy_and_keeps_its_energy(problems: dict[str, Problem]) -> None:
-    """In (z, q_dot) by fast time, without the level sets that the package walks along."""
+def test_layer_changes_q_dot_as_in_numpy_and_conserves_energy(problems: dict[str, Problem]) -> None:
+    """The numpy integration is in (z, q_dot) by fast time, without the package's level sets."""
 
     def rate(tau: float, y: Array) -> Array:
         q_tree = start()
@@ -146,7 +146,7 @@ def test_layer_turns_q_dot_as_in_numpy_and_keeps_its_energy(problems: dict[str, 
 # --- the boundary layer ------------------------------------------------------------------------------------------
 
 
-def test_solution_of_eq_12_is_that_of_the_differential_equation(problems: dict[str, Problem]) -> None:
+def test_solution_of_eq_12_satisfies_differential_equation(problems: dict[str, Problem]) -> None:
     def rate(tau: float, z: Array) -> Array:
         q_tree = start()
         q_tree[Z] = z
@@ -158,7 +158,7 @@ def test_solution_of_eq_12_is_that_of_the_differential_equation(problems: dict[s
     assert_close(solve_eq_12(problem.mechanism, problem.at, W0, taus), solved.y.T - start()[Z], 1e-10)
 
 
-def test_layer_of_the_spf_is_eq_12_to_first_order(problems: dict[str, Problem]) -> None:
+def test_spf_layer_equals_eq_12_to_first_order(problems: dict[str, Problem]) -> None:
     layer = measured_layer(problems["moving"], W0, (1e-4, 1e-5), np.linspace(0.0, 10.0, 41))
     assert_close(layer.misses[0] / layer.misses[1], 10.0, 0.3)
     assert layer.factor < 1.1
@@ -166,7 +166,7 @@ def test_layer_of_the_spf_is_eq_12_to_first_order(problems: dict[str, Problem]) 
 
 
 @pytest.mark.parametrize("w", [np.zeros(2), W0, np.array([-0.02, 0.03])])
-def test_gradient_of_eq_13_is_the_complex_step(five_bar: Pair, w: Array) -> None:
+def test_gradient_of_eq_13_equals_complex_step(five_bar: Pair, w: Array) -> None:
     def g(z: Array) -> Array:
         q_tree = off.q_tree.astype(complex)
         q_tree[Z] = z
@@ -180,31 +180,31 @@ def test_gradient_of_eq_13_is_the_complex_step(five_bar: Pair, w: Array) -> None
         assert_close(theirs, -np.eye(2), 1e-11)
 
 
-def test_eigenvalues_around_are_nan_where_the_branch_ends(five_bar: Pair) -> None:
+def test_eigenvalues_are_nan_beyond_end_of_branch(five_bar: Pair) -> None:
     mechanism, _ = five_bar
-    near = eigenvalues_around(mechanism, mechanism.assembled, 0.01, 8)
-    assert near.shape == (8, 2)
-    assert np.all(near.real < 0)
+    values = eigenvalues_around(mechanism, mechanism.assembled, 0.01, 8)
+    assert values.shape == (8, 2)
+    assert np.all(values.real < 0)
     assert np.isnan(eigenvalues_around(mechanism, mechanism.assembled, 2.0, 8)).all()
 
 
 @pytest.mark.parametrize("rows", [2, 3, 6])
 def test_directions_are_unit_vectors(rows: int) -> None:
-    found = directions(rows, 12)
-    assert found.shape == (12, rows)
-    assert_close(np.linalg.norm(found, axis=1), 1.0, 1e-14)
-    assert np.linalg.matrix_rank(found) == rows
+    vectors = directions(rows, 12)
+    assert vectors.shape == (12, rows)
+    assert_close(np.linalg.norm(vectors, axis=1), 1.0, 1e-14)
+    assert np.linalg.matrix_rank(vectors) == rows
 
 
 # --- consistent starts -------------------------------------------------------------------------------------------
 
 
-def test_epsilon_changes_nothing_from_a_consistent_start(problems: dict[str, Problem]) -> None:
+def test_epsilon_has_no_influence_from_consistent_start(problems: dict[str, Problem]) -> None:
     rtol = 1e-5
-    found = measure(problems["moving"], rtol, (1e-1, 1e-4, 1e-8), (1e-1, 1e-12), t_end=0.5)
-    assert np.all(found.printed < 10 * rtol)
-    assert np.all(found.printed < 10 * found.radau)
-    assert np.all(found.eq_17 == found.dop853)
+    study = measure(problems["moving"], rtol, (1e-1, 1e-4, 1e-8), (1e-1, 1e-12), t_end=0.5)
+    assert np.all(study.printed < 10 * rtol)
+    assert np.all(study.printed < 10 * study.radau)
+    assert np.all(study.eq_17 == study.dop853)
 
 
 # --- verdicts ----------------------------------------------------------------------------------------------------
@@ -225,14 +225,14 @@ def convergence(order: float, unsure: float = 1e-3) -> Convergence:
         (convergence(1.0, unsure=0.2), "does not hold"),
     ],
 )
-def test_verdict_on_the_order(moving: Convergence, verdict: str) -> None:
+def test_order_verdict_follows_orders(moving: Convergence, verdict: str) -> None:
     claim = tikhonov.order_claim(convergence(1.0), moving, "start", "figure.png")
     assert claim.verdict == verdict
     assert claim.table is not None
     assert float(claim.table[1][2][1]) == pytest.approx(1e-6)
 
 
-def test_verdict_on_the_velocity(problems: dict[str, Problem]) -> None:
+def test_velocity_verdict_follows_numbers(problems: dict[str, Problem]) -> None:
     problem = problems["moving"]
     flat = replace(convergence(1.0), x=np.full(3, 0.07))
     claim = tikhonov.velocity_claim(convergence(1.0), flat, convergence(1.0), problem, problem, "figure.png")

@@ -43,7 +43,7 @@ from tests.analytic.five_bar import tracking as numpy_tracking
 from tests.conftest import Pair, assert_close
 
 EPSILON = 1e-3
-SHORT = {"t_end": 0.02, "solver.output_dt": 5e-5, "solver.method": "DOP853", "solver.rtol": 1e-10}
+SHORT_RUN = {"t_end": 0.02, "solver.output_dt": 5e-5, "solver.method": "DOP853", "solver.rtol": 1e-10}
 
 
 def errors(t: float, q_tree: Array, q_dot: Array) -> tuple[Array, Array]:
@@ -52,14 +52,14 @@ def errors(t: float, q_tree: Array, q_dot: Array) -> tuple[Array, Array]:
 
 
 def numpy_V(t: float, q_tree: Array, q_dot: Array) -> float:
-    """Eq. 18 with eq. 22's gains, w = 0."""
+    """Return eq. 18 with eq. 22's gains and w = 0."""
     e, e_dot = errors(t, q_tree, q_dot)
     r = e_dot + e
     return float(r @ FIVE_BAR.D(q_tree) @ r / 2 + 10 * e @ e)
 
 
 def on_w(q_tree: Array, w: Array) -> Array:
-    """z corrected by Newton until phi = w."""
+    """Return q_tree with z corrected by Newton to phi = w."""
     q_tree = q_tree.copy()
     for _ in range(20):
         q_tree[Z] -= np.linalg.solve(FIVE_BAR.phi_z(q_tree), FIVE_BAR.phi(q_tree) - w)
@@ -68,7 +68,7 @@ def on_w(q_tree: Array, w: Array) -> Array:
 
 
 def velocities(q_tree: Array, q_dot: Array, epsilon: float) -> tuple[Array, Array]:
-    """The tree's velocity rho q_dot, and the one that eq. 8 gives it."""
+    """Return the tree's velocity rho q_dot, and the velocity by eq. 8."""
     level = FIVE_BAR.rho(q_tree) @ q_dot
     actual = level.copy()
     actual[Z] -= np.linalg.solve(FIVE_BAR.phi_z(q_tree), FIVE_BAR.phi(q_tree)) / epsilon
@@ -83,43 +83,43 @@ def D_dot(q_tree: Array, v_tree: Array) -> Array:
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_function_and_rate_are_those_of_the_numpy_five_bar(formulation: str) -> None:
-    found = lyapunov_along({"formulation": formulation, **SHORT})
-    assert found.mismatch < 1e-7
-    assert found.monotone
+def test_lyapunov_function_and_rate_equal_numpy_five_bar(formulation: str) -> None:
+    recorded = lyapunov_along({"formulation": formulation, **SHORT_RUN})
+    assert recorded.mismatch < 1e-7
+    assert recorded.monotone
 
     def rate(t: float, y: Array) -> Array:
         q_tree = FIVE_BAR.sigma(y[:2])
         return np.concatenate([y[2:], FIVE_BAR.acceleration(q_tree, y[2:], numpy_tracking(FIVE_BAR)(t, q_tree, y[2:]))])
 
     y0 = np.concatenate([FIVE_BAR.equilibrium()[Q], np.zeros(2)])
-    y = solve_ivp(rate, (0, 0.02), y0, t_eval=found.t[::40], method="DOP853", rtol=1e-11, atol=1e-13).y.T
-    states = [(t, FIVE_BAR.sigma(x[:2]), x[2:]) for t, x in zip(found.t[::40], y, strict=True)]
-    assert_close(found.value[::40], [numpy_V(*state) for state in states], 1e-8)
+    y = solve_ivp(rate, (0, 0.02), y0, t_eval=recorded.t[::40], method="DOP853", rtol=1e-11, atol=1e-13).y.T
+    states = [(t, FIVE_BAR.sigma(x[:2]), x[2:]) for t, x in zip(recorded.t[::40], y, strict=True)]
+    assert_close(recorded.value[::40], [numpy_V(*state) for state in states], 1e-8)
     expected = [-10 * (e_dot @ e_dot + e @ e) for e, e_dot in (errors(*state) for state in states)]
-    assert_close(found.predicted[::40], expected, 1e-8, relative=True)
+    assert_close(recorded.predicted[::40], expected, 1e-8, relative=True)
 
 
-def test_record_begins_where_it_should() -> None:
-    whole, later = (lyapunov_along({"formulation": "reduced", **SHORT}, since) for since in (0.0, 0.01))
+def test_record_begins_at_since() -> None:
+    complete, later = (lyapunov_along({"formulation": "reduced", **SHORT_RUN}, since) for since in (0.0, 0.01))
     assert len(later.t) == 201
-    assert_close(later.t, whole.t[-201:], 0.0)
-    assert_close(later.value, whole.value[-201:], 0.0)
+    assert_close(later.t, complete.t[-201:], 0.0)
+    assert_close(later.value, complete.value[-201:], 0.0)
     assert later.mismatch < 1e-7
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_rho_misses_eq_19_by_what_is_not_skew(moving: bool) -> None:
-    """With C at rho q_dot dV/dt is off by r^T (D_dot - 2 C) r / 2, D_dot along the actual velocity."""
+def test_rate_error_with_rho_equals_nonskew_part(moving: bool) -> None:
+    """With C at rho q_dot the error of dV/dt is r^T (D_dot - 2 C) r / 2, with D_dot along the actual velocity."""
     q_dot = np.array([1.0, -2.0]) if moving else np.zeros(2)
     q_tree = on_w(FIVE_BAR.equilibrium(), np.array(W0))
     e, e_dot = errors(0.0, q_tree, q_dot)
     level, actual = velocities(q_tree, q_dot, EPSILON)
-    found = {name: off_manifold(EPSILON, name, moving) for name in ("rho", "actual")}
-    assert found["actual"].mismatch < 1e-8
-    assert found["rho"].mismatch > 1e-3
+    records = {name: off_manifold(EPSILON, name, moving) for name in ("rho", "actual")}
+    assert records["actual"].mismatch < 1e-8
+    assert records["rho"].mismatch > 1e-3
     for name, at in (("rho", level), ("actual", actual)):
-        record, r = found[name], e + e_dot
+        record, r = records[name], e + e_dot
         gap = r @ (D_dot(q_tree, actual) - 2 * FIVE_BAR.C(q_tree, at)) @ r / 2
         w = np.array(W0)
         assert_close(record.predicted[0], -10 * (e_dot @ e_dot + e @ e) - w @ w / EPSILON, 1e-10, relative=True)
@@ -127,17 +127,17 @@ def test_rho_misses_eq_19_by_what_is_not_skew(moving: bool) -> None:
         assert abs(gap) > 0.01 if name == "rho" else abs(gap) < 1e-10
 
 
-def test_runs_that_cannot_be_recorded_are_named() -> None:
+def test_unsuitable_runs_raise() -> None:
     with pytest.raises(InputError, match="not a scene with tracking control"):
         lyapunov_along({}, scene="five_bar/swing")
     with pytest.raises(NumericalError, match="max_rhs"):
-        lyapunov_along({**SHORT, "solver.max_rhs": 20})
+        lyapunov_along({**SHORT_RUN, "solver.max_rhs": 20})
 
 
 # --- D_dot - 2 C -------------------------------------------------------------------------------------------------
 
 
-def test_defect_is_the_numpy_five_bars(five_bar: Pair) -> None:
+def test_skewness_defect_equals_numpy_five_bar(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     random = np.random.default_rng(1)
     for _ in range(5):
@@ -153,29 +153,29 @@ def test_defect_is_the_numpy_five_bars(five_bar: Pair) -> None:
             assert_close(defect(mechanism, at, along, velocity), expected, 1e-8 * max(1.0, expected))
 
 
-def test_convention_decides_off_the_closure_only(pair: Pair) -> None:
-    found = skewness(pair[0], 6, EPSILON)
-    assert found.states == 6
-    assert max(found.on, found.off_rho_rho, found.off_actual_actual) < 1e-9
-    assert found.off_actual_rho > 1.5
+def test_convention_matters_only_off_manifold(pair: Pair) -> None:
+    skew = skewness(pair[0], 6, EPSILON)
+    assert skew.states == 6
+    assert max(skew.on, skew.off_rho_rho, skew.off_actual_actual) < 1e-9
+    assert skew.off_actual_rho > 1.5
 
 
-def test_more_freedoms_are_skew_alike() -> None:
+def test_skewness_with_more_freedoms() -> None:
     """Two chains of three links: n = 6, d = 4."""
     ring = linkage(
         [(0.0, [1.0, 1.0, 1.0]), (1.0, [1.0, 1.0, 1.0])], [2.2, -0.8, -0.7, 0.9, 0.8, 0.7], ["a1", "a2", "b1", "b2"]
     )
-    found = skewness(ring, 4, EPSILON)
-    assert found.states == 4
-    assert max(found.on, found.off_rho_rho, found.off_actual_actual) < 1e-8
-    assert found.off_actual_rho > 1.0
+    skew = skewness(ring, 4, EPSILON)
+    assert skew.states == 4
+    assert max(skew.on, skew.off_rho_rho, skew.off_actual_actual) < 1e-8
+    assert skew.off_actual_rho > 1.0
 
 
 # --- the algebra of the gains ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
-def test_rate_form_is_the_rate_of_a_linear_closed_loop(symmetric: bool) -> None:
+def test_rate_form_equals_rate_of_linear_closed_loop(symmetric: bool) -> None:
     """D constant, C = 0: D r_dot = -K_D r, q_tilde_dot = r - Lambda q_tilde."""
     random = np.random.default_rng(2)
     D, K_D, S = (a @ a.T + np.eye(3) for a in random.standard_normal((3, 3, 3)))
@@ -198,7 +198,7 @@ def test_rate_form_is_the_rate_of_a_linear_closed_loop(symmetric: bool) -> None:
     assert gap < 1e-12 if symmetric else gap > 0.1
 
 
-def test_gains_that_the_program_takes() -> None:
+def test_accepted_gains_satisfy_gain_condition() -> None:
     K_D = np.array([[10.0, 3.0], [3.0, 5.0]])
     assert tracking.accepted(np.linalg.solve(K_D, np.diag([1.0, 2.0])), K_D)
     assert not tracking.accepted(np.diag([1.0, 3.0]), K_D)
@@ -233,7 +233,7 @@ def own_sigma(tolerance: float) -> tuple[OwnSigma, Terms]:
     return OwnSigma(problem.force, sigma), Terms(problem.mechanism, start, np.zeros(4))
 
 
-def test_a_controllers_own_sigma_keeps_its_z_within_the_tolerance() -> None:
+def test_controller_sigma_solves_z_within_tolerance() -> None:
     q_dot, q = np.array([1.0, -2.0]), FIVE_BAR.equilibrium()[Q] + [0.01, 0.005]
     moved = FIVE_BAR.sigma(q)
     stale = FIVE_BAR.equilibrium()
@@ -250,28 +250,28 @@ def test_a_controllers_own_sigma_keeps_its_z_within_the_tolerance() -> None:
     assert np.abs(right - wrong).max() > 1e-3
 
 
-def test_under_a_shared_loose_sigma_only_the_start_is_felt_in_q_and_the_controllers_own_goes_on_deviating() -> None:
+def test_only_separate_loose_sigma_keeps_disturbing_q() -> None:
     times = np.linspace(0.0, 0.4, 9)
-    exact, shared, own = (
+    exact, shared, separate = (
         track(SCENE, setting, times)
         for setting in (
             EXACT,
             replace(EXACT, rtol=1e-8, tolerance=1e-2),
-            replace(EXACT, method="RK45", rtol=1e-3, own=1e-2),
+            replace(EXACT, method="RK45", rtol=1e-3, controller_tolerance=1e-2),
         )
     )
     assert exact.open < 1e-12
     assert 1e-3 < shared.open <= 1e-2
-    assert 1e-3 < own.open <= 1e-2
+    assert 1e-3 < separate.open <= 1e-2
     assert_close(exact.q[0], FIVE_BAR.equilibrium()[Q], 1e-10)
-    # plant and controller agree, so e_dot = -e once r has died out, whatever z is
-    felt, goes_on = ((x.q - exact.q)[1:] * np.exp(times[1:, None]) for x in (shared, own))
+    # Plant and controller agree, so e_dot = -e for any z after r has decayed.
+    felt, goes_on = ((x.q - exact.q)[1:] * np.exp(times[1:, None]) for x in (shared, separate))
     assert np.abs(felt).max() < 1e-4
     assert np.ptp(felt, axis=0).max() < 1e-7
     assert np.ptp(goes_on, axis=0).max() > 3e-4
 
 
-def test_eq_8_and_the_reduced_model_track_like_numpy() -> None:
+def test_eq_8_and_reduced_model_track_like_numpy() -> None:
     times = np.linspace(0.0, 0.2, 5)
 
     def rate(t: float, y: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Bad input as a table: files as a user might have broken them, a command, and what it must answer."""
+"""Table of invalid input: edited files, a command, and the expected error message."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ SPEAKS_JSON = ("list", "check", "terms", "run", "inverse", "sensitivities", "imp
 
 @dataclass(frozen=True)
 class Bad:
-    """One wrong thing.
+    """One case of invalid input.
 
-    `edits` replaces text in a copy of the five-bar, which is the folder `bar`; `files` are written beside it;
-    the command runs there. `says` must all be in the one message.
+    `edits` replaces text in a copy of the five-bar, the folder `bar`. `files` are written next to it, and the command
+    runs there. All fragments in `says` must be in the message, which must be one line.
     """
 
     what: str
@@ -29,7 +29,7 @@ class Bad:
 
 
 def expect(case: Bad, bar: Path) -> None:
-    """Break the copy, run the command in both ways: one message, on the right stream, with all it should say."""
+    """Apply the edits, run the command with and without --json, and check message, stream and exit code."""
     for name, (old, new) in case.edits.items():
         text = (bar / name).read_text(encoding="utf-8")
         assert old in text, f"{old!r} is not in {name}"
@@ -39,15 +39,15 @@ def expect(case: Bad, bar: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
     status = "stopped" if case.code == STOPPED else "error"
-    plain = ckc(*case.words)
-    assert plain.code == case.code, plain.err
-    assert plain.out == ""
-    assert plain.err.startswith(f"{status}: ")
-    assert plain.err.count("\n") == 1, plain.err
+    outcome = ckc(*case.words)
+    assert outcome.code == case.code, outcome.err
+    assert outcome.out == ""
+    assert outcome.err.startswith(f"{status}: ")
+    assert outcome.err.count("\n") == 1, outcome.err
     for fragment in case.says:
-        assert fragment in plain.err
+        assert fragment in outcome.err
     if case.words and case.words[0] in SPEAKS_JSON:
         as_json = ckc(case.words[0], "--json", *case.words[1:])
         assert as_json.code == case.code
-        assert as_json.err == plain.err
-        assert as_json.json == {"status": status, "message": plain.err.removeprefix(f"{status}: ").rstrip("\n")}
+        assert as_json.err == outcome.err
+        assert as_json.json == {"status": status, "message": outcome.err.removeprefix(f"{status}: ").rstrip("\n")}

@@ -1,4 +1,4 @@
-"""A command line in this process: what it prints, where, and its exit code."""
+"""Run a command line in this process and capture its output and exit code."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from ckc_pin.cli import app
 
 @dataclass(frozen=True)
 class Outcome:
+    """Exit code and captured output of a command."""
+
     code: int
     out: str
     err: str
 
     @property
     def json(self) -> dict[str, Any]:
-        """The one JSON object that standard output must be; NaN and infinity are none in JSON."""
+        """Standard output as one JSON object without NaN and infinity."""
 
         def refuse(name: str) -> None:
             raise AssertionError(f"{name} in JSON")
@@ -37,11 +39,11 @@ class Outcome:
 
 def ckc(*words: str) -> Outcome:
     """Run `ckc WORDS...`."""
-    return called(lambda: sys.exit(app.main()), "ckc", *words)
+    return run_main(lambda: sys.exit(app.main()), "ckc", *words)
 
 
-def called(main: Callable[[], object], *line: str) -> Outcome:
-    """Call what a program starts with, on a command line."""
+def run_main(main: Callable[[], object], *line: str) -> Outcome:
+    """Call the entry point of a program with a command line."""
     out, err = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     code: Any = None

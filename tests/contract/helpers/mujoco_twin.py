@@ -1,4 +1,4 @@
-"""An imported robot beside MuJoCo's own model of the same file, set to the same states."""
+"""An imported robot and MuJoCo's model of the same file, set to the same states."""
 
 from __future__ import annotations
 

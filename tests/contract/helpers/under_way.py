@@ -1,4 +1,4 @@
-"""A command in a process of its own, which is sent signals at known moments of its work."""
+"""Run a command in a separate process, which can be sent signals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["under_way"]
 
 @contextmanager
 def under_way(program: str, *words: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a Python program with words on its command line; it is gone when the context is left."""
+    """Run a Python program with a command line; it is killed when the context is left."""
     with subprocess.Popen(
         [sys.executable, "-c", program, *words],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Other programs on the same mechanism: each a module with `PROGRAM`, `missing`, `version`, `settings`, `compute`."""
+"""Wrappers of other programs, which run the benchmark's works; each implements `Peer`."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ __all__ = ["Peer", "peers"]
 
 
 class Peer(Protocol):
-    """What the report asks of a program."""
+    """Interface of a program in the benchmark."""
 
     name: str
-    packaged: bool  # a program that is installed and called; not a loop that a user would have to write around one
+    packaged: bool  # True for a program as installed; False if its user has to write the loop
 
     def missing(self, work: Work) -> str | None:
-        """Why it cannot do a work; None where it can."""
+        """Return why the program cannot run a work, None if it can."""
         ...
 
     def version(self) -> str:
-        """Its version."""
+        """Return the program's version."""
         ...
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
-        """Names of the settings it is tried with on a work, from coarse to fine steps."""
+        """Yield the names of the settings to run a work with, from coarse to fine steps."""
         ...
 
     def check(self, work: Work) -> str:
-        """How well it agrees with this program at the start, a sentence."""
+        """Return a sentence on how well the program's model agrees with ckc_pin's at the start."""
         ...
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
-        """Run a work; a run that would take longer than the budget, in s, is refused."""
+        """Run a work; refuse a run that would take longer than the budget, in s."""
         ...
 
 
 def peers() -> list[Peer]:
-    """All programs there are wrappers for, whether installed or not."""
+    """Return the wrappers of all programs, installed or not."""
     from scripts.experiments.benchmark.peers.drake import Drake
     from scripts.experiments.benchmark.peers.exudyn import Exudyn
     from scripts.experiments.benchmark.peers.ida import Ida

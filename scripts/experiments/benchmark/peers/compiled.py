@@ -1,4 +1,4 @@
-"""The C++ program beside this file, compiled when it is first wanted and gone with the process."""
+"""Compile the C++ program next to this file at its first use; it is removed when the process ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 __all__ = ["compiler", "program", "version"]
 
 SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
-# The definitions that Pinocchio's headers need; otherwise as the native core is compiled.
+# Definitions that Pinocchio's headers need. The other flags are those of the native core.
 FLAGS = [
     *("-std=c++17", "-O3", "-DNDEBUG", "-w"),
     *("-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"),
@@ -24,17 +24,17 @@ PATIENCE = 300.0  # s
 
 @cache
 def program() -> tuple[Path, str | None]:
-    """Return the program, and why there is none: no compiler, no headers, or what the compiler said."""
+    """Return the path of the program, and why it is missing: no compiler, no headers, or the compiler's error."""
     folder = _folder()
     path, prefix = Path(folder.name) / "loop", _prefix()
-    found = compiler()
-    if found is None:
+    executable = compiler()
+    if executable is None:
         return path, "no C++ compiler was found"
     if prefix is None or not (prefix / "include" / "eigen3").is_dir():
         return path, "Eigen's headers are missing: pip install cmeel-eigen"
     include = ["-isystem", str(prefix / "include"), "-isystem", str(prefix / "include" / "eigen3")]
     library = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default"]
-    command = [found, *FLAGS, *include, str(SOURCE), "-o", str(path), *library]
+    command = [executable, *FLAGS, *include, str(SOURCE), "-o", str(path), *library]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=PATIENCE)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -48,7 +48,7 @@ def program() -> tuple[Path, str | None]:
 
 @cache
 def version() -> str:
-    """Return the versions of what it is made of and with."""
+    """Return the versions of Pinocchio, Boost and the compiler."""
     said = subprocess.run([compiler() or "c++", "--version"], capture_output=True, text=True).stdout.splitlines()[0]
     return f"{metadata.version('libpinocchio')}, Boost {metadata.version('cmeel-boost')}, {said}"
 
@@ -64,7 +64,7 @@ def compiler() -> str | None:
 
 
 def _prefix() -> Path | None:
-    """Return where Pinocchio's wheels keep headers and libraries; None for one that is not from a wheel."""
+    """Return the folder of headers and libraries in Pinocchio's wheels, None for a Pinocchio from elsewhere."""
     try:
         return Path(str(metadata.distribution("libpinocchio").locate_file("cmeel.prefix"))).resolve()
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Drake: a discrete plant with its own loop constraints; in continuous time, where it has none, with bushings."""
+"""Run works in Drake: a discrete plant with loop constraints, or a continuous one with bushings in their place."""
 
 from __future__ import annotations
 
@@ -17,16 +17,22 @@ from ckc_pin.formats.mjcf.writer import place_in_plane
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine
-from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
+from scripts.experiments.benchmark.peers.stepping import (
+    CONTROLLED,
+    dividing_step,
+    halved_steps,
+    run_fixed_step,
+    start_of,
+)
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Drake"]
 
-COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 6  # s, and how many halves
+COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 6  # s, and numbers of halvings
 CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
-POINTS = {"point", "point_2d"}  # what a bushing without torques closes
+POINTS = {"point", "point_2d"}  # loop types that a bushing without torques can replace
 STIFFNESSES, QUICK_STIFFNESSES = (3e4, 1e5, 3e5, 1e6, 1e7, 1e8), (1e5, 1e6)  # of bushings, N/m
-DAMPING = 1e-4  # s, by which the stiffness becomes the bushing's damping
+DAMPING = 1e-4  # s: damping of a bushing over its stiffness
 ACCURACIES, QUICK_ACCURACIES = (1e-2, 1e-3), (1e-2,)
 
 
@@ -58,7 +64,7 @@ class Drake:
         return metadata.version("drake")
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
-        for dt in halved(work, COARSEST, QUICK_STEPS if quick else STEPS):
+        for dt in halved_steps(work, COARSEST, QUICK_STEPS if quick else STEPS):
             yield f"SAP, dt {dt:.3g}"
         if {loop.type for loop in work.mechanism.spec.loop} <= POINTS and not work.mechanism.spec.coupling:
             stiffnesses, accuracies = (QUICK_STIFFNESSES, QUICK_ACCURACIES) if quick else (STIFFNESSES, ACCURACIES)
@@ -88,8 +94,8 @@ class Drake:
         solver, *said = setting.split(", ")
         numbers = [float(number) for part in said for number in part.split() if number[0].isdigit()]
         discrete = solver == "SAP"
-        dt = numbers[0] if discrete else work.t_end  # what takes steps of its own goes from instant to instant
-        plant = _Plant(work.mechanism, divided(work, dt)) if discrete else _Plant(work.mechanism, 0.0, numbers[0])
+        dt = numbers[0] if discrete else work.t_end  # an integrator with its own steps advances from instant to instant
+        plant = _Plant(work.mechanism, dividing_step(work, dt)) if discrete else _Plant(work.mechanism, 0.0, numbers[0])
         q_tree, v_tree = start_of(work)
         running: dict[str, Any] = {}
 
@@ -99,25 +105,27 @@ class Drake:
             plant.put(context, q_tree, v_tree)
             running["simulator"], running["t"] = Simulator(plant.plant, context), 0.0
             if not discrete:
-                integrator: Any = ResetIntegratorFromFlags(running["simulator"], "runge_kutta3", divided(work, dt))
+                integrator: Any = ResetIntegratorFromFlags(
+                    running["simulator"], "runge_kutta3", dividing_step(work, dt)
+                )
                 integrator.set_target_accuracy(numbers[1])
             running["simulator"].Initialize()
 
         def step(many: int) -> None:
-            running["t"] += many * divided(work, dt)
+            running["t"] += many * dividing_step(work, dt)
             running["simulator"].AdvanceTo(running["t"])
 
         def state() -> tuple[Array, Array]:
             return plant.state(running["simulator"].get_context())
 
-        motion = stepped(work, dt, FixedStepProgram(reset, step, state), budget)
+        motion = run_fixed_step(work, dt, FixedStepProgram(reset, step, state), budget)
         if discrete or motion.status != "done":
             return motion
         return replace(motion, steps=running["simulator"].get_integrator().get_num_steps_taken())
 
 
 class _Plant:
-    """A mechanism as Drake's plant: discrete with step dt, or continuous with bushings of a stiffness, N/m."""
+    """A mechanism as a Drake plant: discrete with step dt, or continuous with bushings of a stiffness in N/m."""
 
     def __init__(self, mechanism: Mechanism, dt: float, bushing: float = 0.0) -> None:
         from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
@@ -125,8 +133,10 @@ class _Plant:
         self.mechanism = mechanism
         self.plant: Any = MultibodyPlant(dt)
         if dt > 0:
-            self.plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)  # which has constraints
-            self.plant.SetUseSampledOutputPorts(False)  # a third of the time
+            self.plant.set_discrete_contact_approximation(
+                DiscreteContactApproximation.kSap
+            )  # the approximation that supports constraints
+            self.plant.SetUseSampledOutputPorts(False)  # saves two thirds of the time
         self.plant.mutable_gravity_field().set_gravity_vector(mechanism.tree.model.gravity.linear)
         self._bodies: list[Any] = [self.plant.world_body()]
         self._joints: list[Any] = []
@@ -191,7 +201,7 @@ class _Plant:
             else:
                 plant.AddBallConstraint(first, a.translation, second, b.translation)
             if loop.type == "hinge":  # a second point of the axis
-                ends = [_along(a, loop.axis_a, mechanism.size), _along(b, loop.axis_b, mechanism.size)]
+                ends = [_point_on_axis(a, loop.axis_a, mechanism.size), _point_on_axis(b, loop.axis_b, mechanism.size)]
                 plant.AddBallConstraint(first, ends[0], second, ends[1])
         for group in mechanism.closure.groups:
             for row, offset in zip(group.matrix, group.offset, strict=True) if isinstance(group, Affine) else ():
@@ -202,10 +212,10 @@ class _Plant:
                 plant.AddCouplerConstraint(self._joints[k], self._joints[other], -row[other], offset)
 
     def _hold(self, stiffness: float) -> None:
-        """Close loops, all of them points, by bushings."""
+        """Close the loops, which are all points, by bushings."""
         from pydrake.multibody.tree import FixedOffsetFrame, LinearBushingRollPitchYaw
 
-        every, none = np.ones(3), np.zeros(3)
+        ones, none = np.ones(3), np.zeros(3)
         for loop in self.mechanism.spec.loop:
             a, b = (self.mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
             b = place_in_plane(self.mechanism, loop, a, b) if loop.type == "point_2d" else b
@@ -217,10 +227,10 @@ class _Plant:
             ]
             bushing: Callable[..., Any] = LinearBushingRollPitchYaw
             damping = DAMPING * stiffness
-            self.plant.AddForceElement(bushing(*ends, none, none, stiffness * every, damping * every))
+            self.plant.AddForceElement(bushing(*ends, none, none, stiffness * ones, damping * ones))
 
     def _spring(self) -> None:
-        """Add springs between frames; those on joints have an element for hinges only."""
+        """Add springs between frames and on joints; Drake's joint spring exists for hinges only."""
         from pydrake.multibody.tree import LinearSpringDamper, RevoluteJoint, RevoluteSpring
 
         mechanism, springs = self.mechanism, self.mechanism.springs
@@ -239,11 +249,11 @@ class _Plant:
 
 
 def _placed(frame: Any) -> Any:
-    """Return a frame or a placement as Drake's."""
+    """Return a frame or a placement as Drake's RigidTransform."""
     from pydrake.math import RigidTransform, RotationMatrix
 
     return RigidTransform(RotationMatrix(frame.rotation), frame.translation)
 
 
-def _along(frame: Frame, axis: tuple[float, float, float], size: float) -> Array:
+def _point_on_axis(frame: Frame, axis: tuple[float, float, float], size: float) -> Array:
     return frame.translation + frame.rotation @ np.array(axis) / np.linalg.norm(axis) * size

@@ -1,4 +1,4 @@
-"""Exudyn: rigid bodies in redundant coordinates, joints and loops alike as constraints, generalized alpha."""
+"""Run works in Exudyn: rigid bodies in redundant coordinates, all joints and loops as constraints."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ from ckc_pin.mechanism.closure import perpendicular
 from ckc_pin.mechanism.frames import Frame
 from scripts.experiments.benchmark.peers.exudyn_plane import Plane, in_plane
 from scripts.experiments.benchmark.peers.exudyn_steps import Steps
-from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
+from scripts.experiments.benchmark.peers.stepping import (
+    CONTROLLED,
+    dividing_step,
+    halved_steps,
+    run_fixed_step,
+    start_of,
+)
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Exudyn"]
 
-COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 7  # s, and how many halves
-# 1 damps nothing, 0.9 is the default and steadier
+COARSEST, STEPS, QUICK_STEPS = 1e-2, 10, 7  # s, and numbers of halvings
+# Spectral radius: 1 has no numerical damping, 0.9 is the default and more stable.
 SOLVERS = (("GeneralizedAlpha", 1.0), ("GeneralizedAlpha", 0.9), ("TrapezoidalIndex2", 1.0))
 CLOSED = ("point", "point_2d", "hinge", "weld", "distance")
 
 
 class Exudyn:
-    """Generalized alpha on index 3, and the trapezoidal rule on index 2; its explicit solvers take no loops."""
+    """Generalized alpha on index 3 and the trapezoidal rule on index 2; the explicit solvers do not support loops."""
 
     name = "Exudyn"
     packaged = True
@@ -53,7 +59,7 @@ class Exudyn:
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
         solvers, steps = (SOLVERS[1:], QUICK_STEPS) if quick else (SOLVERS, STEPS)
-        for (solver, radius), dt in product(solvers, halved(work, COARSEST, steps)):
+        for (solver, radius), dt in product(solvers, halved_steps(work, COARSEST, steps)):
             yield f"{solver}, spectral radius {radius:g}, dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
@@ -69,7 +75,7 @@ class Exudyn:
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         solver, radius, step_size = setting.split(", ")
-        dt, flat = divided(work, float(step_size.split()[-1])), in_plane(work)
+        dt, flat = dividing_step(work, float(step_size.split()[-1])), in_plane(work)
         running: dict[str, Any] = {}
 
         def reset() -> None:
@@ -82,7 +88,7 @@ class Exudyn:
             q_tree, v_tree = running["system"].state()
             return q_tree, v_tree
 
-        return stepped(work, dt, FixedStepProgram(reset, step, state), budget)
+        return run_fixed_step(work, dt, FixedStepProgram(reset, step, state), budget)
 
 
 class _System(Steps):
@@ -120,12 +126,12 @@ class _System(Steps):
         self.assemble()
 
     def advance(self, solver: str, radius: float, dt: float, many: int) -> None:
-        """Take steps; the state is where they end."""
+        """Advance the state by `many` steps."""
         super().advance(solver, radius, dt, many)
         self._dt = many * dt
 
     def state(self) -> tuple[Array, Array]:
-        """Return q_tree and v_tree; angles, of which bodies know the rotation alone, are followed through turns."""
+        """Return q_tree and v_tree. Whole turns of angles are counted, since bodies only store a rotation."""
         tree, kind = self.mechanism.tree, self.exudyn.OutputVariableType
         if self.t == 0.0:
             return self._q.copy(), self._v.copy()

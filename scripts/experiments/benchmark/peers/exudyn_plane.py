@@ -1,4 +1,4 @@
-"""Exudyn's planar bodies, three coordinates each: what its authors would take for a mechanism in the x-y plane."""
+"""Model a mechanism of the x-y plane with Exudyn's planar bodies, three coordinates each."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Plane", "in_plane"]
 
-PARALLEL = 1e-12  # sine of the angle by which an axis may be off
+PARALLEL = 1e-12  # sine of the largest angle between axes that count as parallel
 
 
 def in_plane(work: Work) -> bool:
-    """Whether hinges turn about z and slides, loops and gravity are in the x-y plane."""
+    """Whether all hinges are about z, and slides, loops and gravity lie in the x-y plane."""
     mechanism, tree = work.mechanism, work.mechanism.tree
     pin.forwardKinematics(tree.model, tree.data, start_of(work)[0])
     for k in range(1, tree.model.njoints):
@@ -33,7 +33,7 @@ def in_plane(work: Work) -> bool:
 
 
 class Plane(Steps):
-    """A work's mechanism at its start; body frames lie in the centres of mass, at the start parallel to the world's."""
+    """A work's mechanism at its start, with body frames in the centres of mass, parallel to the world's."""
 
     def __init__(self, work: Work) -> None:
         super().__init__(work)
@@ -147,7 +147,7 @@ class Plane(Steps):
         return frame.translation if frame.joint == 0 else self._placements[frame.joint].act(frame.translation)
 
     def _point(self, body: int, k: int, at: list[Array], rate: list[Array]) -> tuple[Array, Array]:
-        """Where on a body the origin of joint k is that was there at the start, and how fast."""
+        """Return position and velocity of the point of a body that was the origin of joint k at the start."""
         arm = _turned(at[body][2]) @ (self._placements[k].translation - self._centers[body])[:2]
         place = self._centers[body][:2] + at[body][:2] + arm
         return place, rate[body][:2] + rate[body][2] * np.array([-arm[1], arm[0]])

@@ -1,4 +1,4 @@
-"""Exudyn's solvers on a mechanism, however it is modelled in it."""
+"""Step a mechanism with Exudyn's solvers, for spatial and planar models."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Steps"]
 
-FEW = 20  # bodies, up to which the dense solver is the faster one
+MAX_DENSE_BODIES = 20  # number of bodies up to which the dense solver is faster
 
 
 class Steps:
-    """A system of Exudyn's under construction, then one that takes steps."""
+    """An Exudyn system: first constructed, then stepped."""
 
     def __init__(self, work: Work) -> None:
         import exudyn
@@ -25,26 +25,28 @@ class Steps:
         self._bodies: list[Any] = []  # the ground first
 
     def assemble(self) -> None:
-        """End construction."""
+        """Assemble the system after its construction."""
         self.mbs.Assemble()
         self._settings: Any = self.exudyn.SimulationSettings()
         time, linear = self._settings.timeIntegration, self.exudyn.LinearSolverType
-        time.newton.modifiedNewtonJacUpdatePerStep = True  # fewer iterations, a third of the time; else its defaults
+        time.newton.modifiedNewtonJacUpdatePerStep = (
+            True  # fewer iterations, a third of the time; the other options are defaults
+        )
         time.verboseMode = 0
-        time.adaptiveStep = False  # else a step that fails is tried shorter without end
+        time.adaptiveStep = False  # otherwise a failing step is repeated with shorter steps without end
         self._settings.solution.file.write = False
-        redundant = bool(self.mechanism.redundant)  # the sparse solver does not take a singular Jacobian
-        dense = redundant or self.mechanism.tree.model.njoints <= FEW
+        redundant = bool(self.mechanism.redundant)  # the sparse solver fails with a singular Jacobian
+        dense = redundant or self.mechanism.tree.model.njoints <= MAX_DENSE_BODIES
         self._settings.linearSolver.solverType = linear.EigenDense if dense else linear.EigenSparse
         self._settings.linearSolver.ignoreSingularJacobian = redundant
 
     def kinetic_energy(self) -> float:
-        """Return the sum over the bodies."""
+        """Return the kinetic energy of all bodies, J."""
         kind = self.exudyn.OutputVariableType.KineticEnergy
         return float(sum(self.mbs.GetObjectOutputBody(body, kind, [0, 0, 0]) for body in self._bodies[1:]))
 
     def advance(self, solver: str, radius: float, dt: float, many: int) -> None:
-        """Take steps; the state is where they end."""
+        """Advance the state by `many` steps."""
         time = self._settings.timeIntegration
         time.generalizedAlpha.spectralRadius = radius
         time.numberOfSteps, time.startTime, time.endTime = many, self.t, self.t + many * dt

@@ -1,12 +1,13 @@
-"""SUNDIALS IDA through scikit-sundae, on eq. 1 as Gear, Gupta and Leimkuhler stabilise it, with this program's terms.
+"""Run works with SUNDIALS IDA through scikit-sundae, on eq. 1 as stabilised by Gear, Gupta and Leimkuhler.
 
     q_dot = v - J^T mu
     D' v_dot + C' v + h' = u' + J^T lambda
     phi(q) = 0
     J v = 0
 
-Nothing is differentiated twice, solved for an acceleration or projected: IDA's Newton iteration closes the loops on
-both levels. mu is zero but for errors. Of redundant rows those are taken that determine the motion at the start.
+Terms are ckc_pin's. There is no second derivative of phi, no solve for accelerations and no projection: IDA's Newton
+iteration satisfies the constraints on both levels. mu is zero up to errors. Redundant rows are left out by a choice of
+independent rows at the start.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Ida", "Stabilised"]
 
-FREE = 1e8  # absolute tolerance of mu and lambda: they are not part of the error that is controlled
-MANY = 1_000_000  # of IDA's own bounds on steps
+FREE = 1e8  # absolute tolerance of mu and lambda, which excludes them from the error control
+MAX_STEPS = 1_000_000  # replaces IDA's default bound on the number of steps
 
 
 class Ida:
-    """Steps of its own, its own interpolation to the instants; the residual is in NumPy."""
+    """IDA with its own step control and interpolation to the instants; the residual is evaluated in NumPy."""
 
     name = "SUNDIALS IDA"
     packaged = True
@@ -69,7 +70,7 @@ class Ida:
             algebraic_idx=2 * n + np.arange(multipliers),
             rtol=rtol,
             atol=np.concatenate([np.full(2 * n, rtol / 100), np.full(multipliers, FREE)]),
-            max_num_steps=MANY,
+            max_num_steps=MAX_STEPS,
         )
         walls: list[float] = []
         while not walls or (walls[-1] < REPEAT_BELOW_S and len(walls) < MAX_REPEATS):
@@ -90,7 +91,7 @@ class Ida:
 
 
 class Stabilised:
-    """Y = (q, v, mu, lambda): its start and rate there, and the residual."""
+    """Stabilised equations in Y = (q, v, mu, lambda): consistent start and residual."""
 
     def __init__(self, dae: Dae) -> None:
         from scipy.linalg import qr
@@ -111,14 +112,14 @@ class Stabilised:
         self.deadline, self.count = perf_counter() + budget, 0
 
     def options(self, rtol: float) -> dict[str, Any]:
-        """IDA's own."""
+        """Return IDA's options."""
         motion, rank = 2 * self.n, len(self.rows)
         atol = np.concatenate([np.full(motion, rtol / 100), np.full(2 * rank, FREE)])
         return {
             "algebraic_idx": np.arange(motion, motion + 2 * rank),
             "rtol": rtol,
             "atol": atol,
-            "max_num_steps": MANY,
+            "max_num_steps": MAX_STEPS,
         }
 
     def residual(self, t: float, Y: Array, Y_dot: Array, residual: Array) -> None:
@@ -137,6 +138,6 @@ class Stabilised:
 
 
 def _applied(terms: Terms, u_tree: Array) -> Array:
-    """Everything but inertia and the loops' forces, shape (n,)."""
+    """Return applied forces less C' v' + h', shape (n,): everything except inertia and constraint forces."""
     force = u_tree - terms.bias_tree
     return force + terms.damping_force if terms.mechanism.springs.any_damping else force

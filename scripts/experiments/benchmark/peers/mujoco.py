@@ -1,4 +1,4 @@
-"""MuJoCo: loops as soft constraints, fixed steps. The model is what `ckc export` writes."""
+"""Run works in MuJoCo, with loops as soft constraints and fixed steps. The model is that of `ckc export`."""
 
 from __future__ import annotations
 
@@ -16,21 +16,32 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.formats.exporting import export
 from ckc_pin.mechanism.mechanism import Mechanism
-from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
+from scripts.experiments.benchmark.peers.stepping import (
+    CONTROLLED,
+    dividing_step,
+    halved_steps,
+    run_fixed_step,
+    start_of,
+)
 from scripts.experiments.benchmark.work import Work
 
 __all__ = ["Mujoco"]
 
-COARSEST, STEPS, QUICK_STEPS, SOFT_STEPS = 2e-2, 13, 8, 5  # s, and how many halves; softness soon outweighs the step
+COARSEST, STEPS, QUICK_STEPS, SOFT_STEPS = (
+    2e-2,
+    13,
+    8,
+    5,
+)  # s, and numbers of halvings; few for default constraints, whose softness dominates
 INTEGRATORS = ("Euler", "implicitfast", "implicit", "RK4")
 QUICK_INTEGRATORS = ("implicitfast", "RK4")
 DEFAULT, STIFF, FIRM = "default", "solref 2 dt", "solref 4 dt"  # time constants of the constraints
 
 
 class Mujoco:
-    """MuJoCo with the constraints' default settings, and as stiff as its manual lets them be.
+    """MuJoCo with default constraint settings, and with the stiffest ones that its manual allows.
 
-    The model has no shapes, and what it does not use is switched off; a run that blew up is not to start again.
+    The model has no shapes, and unused features are switched off. A diverged run must not reset itself.
     """
 
     name = "MuJoCo"
@@ -55,7 +66,7 @@ class Mujoco:
         for integrator in integrators:
             stiffnesses = {DEFAULT: SOFT_STEPS, STIFF: steps, **({FIRM: steps} if integrator == "RK4" else {})}
             for stiffness, many in stiffnesses.items():
-                for dt in halved(work, COARSEST, many):
+                for dt in halved_steps(work, COARSEST, many):
                     yield f"{integrator}, {stiffness}, dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
@@ -85,8 +96,8 @@ class Mujoco:
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         integrator, stiffness, step = setting.split(", ")
         dt, model = float(step.removeprefix("dt ")), load_model(_text(work.mechanism))
-        configure_model(model, integrator, stiffness, divided(work, dt))
-        return stepped(work, dt, make_program(model, work.mechanism, start_of(work)), budget)
+        configure_model(model, integrator, stiffness, dividing_step(work, dt))
+        return run_fixed_step(work, dt, make_program(model, work.mechanism, start_of(work)), budget)
 
 
 def _installed() -> bool:

@@ -1,4 +1,4 @@
-"""Pinocchio's constraintDynamics with its Baumgarte terms, stepped as in its own closed-loop examples."""
+"""Run works with Pinocchio's constraintDynamics and Baumgarte terms, stepped as in its closed-loop examples."""
 
 from __future__ import annotations
 
@@ -13,12 +13,18 @@ from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from scripts.experiments.benchmark.peers.stepping import CONTROLLED, divided, halved, start_of, stepped
+from scripts.experiments.benchmark.peers.stepping import (
+    CONTROLLED,
+    dividing_step,
+    halved_steps,
+    run_fixed_step,
+    start_of,
+)
 from scripts.experiments.benchmark.work import Work
 
-__all__ = ["Pinocchio", "closed", "not_closed"]
+__all__ = ["Pinocchio", "closure_constraints", "closure_unsupported"]
 
-COARSEST, STEPS, QUICK_STEPS = 5e-3, 10, 6  # s, and how many halves
+COARSEST, STEPS, QUICK_STEPS = 5e-3, 10, 6  # s, and numbers of halvings
 GAINS = (10.0, 100.0)  # K_p of the examples, 1/s^2, and a stiffer one; K_d = 2 sqrt(K_p)
 CLOSED_BY = {
     "point": pin.ContactType.CONTACT_3D,
@@ -27,7 +33,9 @@ CLOSED_BY = {
     "weld": pin.ContactType.CONTACT_6D,
 }
 
-Constraint: TypeAlias = tuple[pin.ContactType, int, pin.SE3, int, pin.SE3]  # kind, joint and place on it, twice
+Constraint: TypeAlias = tuple[
+    pin.ContactType, int, pin.SE3, int, pin.SE3
+]  # contact type; joint and placement on it, for both frames
 
 
 class Pinocchio:
@@ -39,13 +47,13 @@ class Pinocchio:
     def missing(self, work: Work) -> str | None:
         if work.mechanism.springs.between_frames or work.mechanism.springs.joint_stiffness.any():
             return "springs are no part of its models"
-        return not_closed(work)
+        return closure_unsupported(work)
 
     def version(self) -> str:
         return str(pin.__version__)
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
-        for gain, dt in product(GAINS, halved(work, COARSEST, QUICK_STEPS if quick else STEPS)):
+        for gain, dt in product(GAINS, halved_steps(work, COARSEST, QUICK_STEPS if quick else STEPS)):
             yield f"K_p {gain:g}, dt {dt:.3g}"
 
     def check(self, work: Work) -> str:
@@ -60,7 +68,7 @@ class Pinocchio:
         pin.initConstraintDynamics(model, data, constraints, constraint_data)
         settings = pin.ProximalSettings(1e-12, 1e-10, 10)  # loops with redundant rows need a small mu
         tau, state = mechanism.springs.constant, {"q": np.empty(0), "v": np.empty(0)}
-        h = divided(work, dt)
+        h = dividing_step(work, dt)
 
         def reset() -> None:
             state["q"], state["v"] = start_of(work)
@@ -76,11 +84,11 @@ class Pinocchio:
         def read() -> tuple[Array, Array]:
             return mechanism.tree.to_coordinates(state["q"]), state["v"]
 
-        return stepped(work, dt, FixedStepProgram(reset, step, read), budget)
+        return run_fixed_step(work, dt, FixedStepProgram(reset, step, read), budget)
 
 
-def not_closed(work: Work) -> str | None:
-    """Say why Pinocchio's constraints do not do for a work; None where they do."""
+def closure_unsupported(work: Work) -> str | None:
+    """Return why Pinocchio's constraints cannot model a work, None if they can."""
     others = {loop.type for loop in work.mechanism.spec.loop} - set(CLOSED_BY)
     if work.controlled:
         return CONTROLLED
@@ -89,8 +97,8 @@ def not_closed(work: Work) -> str | None:
     return None
 
 
-def closed(mechanism: Mechanism) -> Iterator[Constraint]:
-    """Every loop as one constraint, a hinge as two, at points of its axis."""
+def closure_constraints(mechanism: Mechanism) -> Iterator[Constraint]:
+    """Yield each loop as one constraint, and a hinge as two constraints at points of its axis."""
     for loop in mechanism.spec.loop:
         a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
         kind, axes = CLOSED_BY[loop.type], (loop.axis_a, loop.axis_b)
@@ -101,14 +109,14 @@ def closed(mechanism: Mechanism) -> Iterator[Constraint]:
 
 
 def _moved(frame: Frame, axis: Sequence[float] = (1.0, 0.0, 0.0), by: float = 0.0) -> pin.SE3:
-    """Return a frame's place on its joint, moved along an axis of it."""
-    along = np.array(axis) / np.linalg.norm(axis)
-    return pin.SE3(frame.rotation, frame.translation + frame.rotation @ along * by)
+    """Return a frame's placement on its joint, translated along an axis of the frame."""
+    direction = np.array(axis) / np.linalg.norm(axis)
+    return pin.SE3(frame.rotation, frame.translation + frame.rotation @ direction * by)
 
 
 def _constraints(mechanism: Mechanism, gain: float) -> Any:
     constraints = pin.StdVec_RigidConstraintModel()
-    for kind, joint_a, on_a, joint_b, on_b in closed(mechanism):
+    for kind, joint_a, on_a, joint_b, on_b in closure_constraints(mechanism):
         model = pin.RigidConstraintModel(
             kind, mechanism.tree.model, joint_a, on_a, joint_b, on_b, pin.ReferenceFrame.LOCAL
         )

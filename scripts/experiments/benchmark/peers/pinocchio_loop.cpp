@@ -75,10 +75,10 @@ pin::JointModel read_joint() {
 pin::Model read_model() {
   pin::Model model;
   model.gravity.linear() = read_vector(3);
-  for (auto left = read<int>(); left > 0; --left) {
+  for (auto remaining = read<int>(); remaining > 0; --remaining) {
     const auto parent = read<pin::JointIndex>();
     const pin::SE3 placement = read_placement();
-    const auto joint = model.addJoint(parent, read_joint(), placement, std::to_string(left));
+    const auto joint = model.addJoint(parent, read_joint(), placement, std::to_string(remaining));
     const auto mass = read<double>();
     const Eigen::Vector3d center = read_vector(3);
     const Vector moments = read_vector(9);
@@ -110,7 +110,7 @@ struct Problem {
 
   Problem() : model(read_model()), data(model) {
     const double gain = read<double>();
-    for (auto left = read<int>(); left > 0; --left) {
+    for (auto remaining = read<int>(); remaining > 0; --remaining) {
       const auto type = read<int>() == 6 ? pin::CONTACT_6D : pin::CONTACT_3D;
       const auto a = read<pin::JointIndex>();
       const pin::SE3 on_a = read_placement();
@@ -123,7 +123,7 @@ struct Problem {
     pin::initConstraintDynamics(model, data, constraints, constraint_data);
     const auto accuracy = read<double>(), mu = read<double>();
     proximal = pin::ProximalSettings(accuracy, mu, read<int>());
-    for (auto left = read<int>(); left > 0; --left) {
+    for (auto remaining = read<int>(); remaining > 0; --remaining) {
       Spring s;
       for (int end : {0, 1}) s.joint[end] = read<int>(), s.local[end] = read_vector(3);
       s.stiffness = read<double>(), s.rest_length = read<double>(), s.damping = read<double>();

@@ -1,4 +1,4 @@
-"""Pinocchio's constraintDynamics under Boost.Odeint's Runge-Kutta-Fehlberg 7(8), a loop in C++ compiled on demand."""
+"""Run works with Pinocchio's constraintDynamics and Boost.Odeint's Runge-Kutta-Fehlberg 7(8), a C++ loop."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
 from scripts.experiments.benchmark.peers.compiled import program, version
-from scripts.experiments.benchmark.peers.pinocchio import closed, not_closed
+from scripts.experiments.benchmark.peers.pinocchio import closure_constraints, closure_unsupported
 from scripts.experiments.benchmark.peers.stepping import start_of
 from scripts.experiments.benchmark.work import Work
 
@@ -25,23 +25,23 @@ __all__ = ["PinocchioLoop"]
 TOLERANCES = tuple(10.0**-k for k in range(2, 14))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 GAINS = (0.0, 100.0)  # K_p, 1/s^2; K_d = 2 sqrt(K_p)
-# mu, and how often its effect is taken off: one iteration is cheapest, where the rows lose rank only a large mu gets by
+# Proximal parameter mu and number of iterations. One iteration is cheapest; where J loses rank, mu must be large.
 PROXIMAL = ((1e-12, 1), (1e-8, 3), (1e-4, 10), (1e-2, 12))
 QUICK_PROXIMAL = (PROXIMAL[0], PROXIMAL[2])
-ACCURACY = 1e-13  # of the multipliers, at which the iterations end
-START = 5.0  # s for the program to start
+ACCURACY = 1e-13  # accuracy of the multipliers at which the proximal iterations end
+START = 5.0  # s: allowance for the start of the program
 
-Answer = dict[str, list[list[float]]]  # its lines by their first word
+Answer = dict[str, list[list[float]]]  # numbers of the program's output lines, by the first word of the line
 
 
 class PinocchioLoop:
-    """What a capable user of Pinocchio would write next: the strongest peer measured."""
+    """Adaptive explicit integration with Pinocchio, as an experienced user would write it in C++."""
 
     name = "Pinocchio constraintDynamics, RKF78 in C++"
     packaged = False  # the loop is written by hand
 
     def missing(self, work: Work) -> str | None:
-        return not_closed(work) or program()[1]
+        return closure_unsupported(work) or program()[1]
 
     def version(self) -> str:
         return version()
@@ -56,31 +56,31 @@ class PinocchioLoop:
         mechanism, tree = work.mechanism, work.mechanism.tree
         q_tree, v_tree = start_of(work)
         answer = _answer(_problem(work, 0.0, *PROXIMAL[1], TOLERANCES[0], []), None)
-        given = {name: np.array(lines[0]) for name, lines in answer.items()}
+        numbers = {name: np.array(lines[0]) for name, lines in answer.items()}
         terms = Terms(mechanism, mechanism.kinematics(q_tree), v_tree)
         bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
         energy = pin.computeMechanicalEnergy(tree.model, tree.data, q_tree, v_tree)
-        mass = _apart(given["D"].reshape(tree.n, tree.n), terms.D_tree)
+        mass = _relative_difference(numbers["D"].reshape(tree.n, tree.n), terms.D_tree)
         ours = dae_acceleration(terms, np.zeros(tree.n))
         return (
-            f"D' agrees to {mass:.0e}, the bias to {_apart(given['bias'], bias):.0e}, the energy to "
-            f"{abs(given['energy'][0] - energy):.0e} J; the constrained acceleration differs by "
-            f"{_apart(given['acceleration'], ours):.0e}"
+            f"D' agrees to {mass:.0e}, the bias to {_relative_difference(numbers['bias'], bias):.0e}, the energy to "
+            f"{abs(numbers['energy'][0] - energy):.0e} J; the constrained acceleration differs by "
+            f"{_relative_difference(numbers['acceleration'], ours):.0e}"
         )
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         gain, mu, iterations, tolerance = (float(part.split()[1]) for part in setting.split(", "))
         tree = work.mechanism.tree
         try:
-            given = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
+            answer = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
         except subprocess.TimeoutExpired:
             return motion_without_data("refused", f"takes longer than the budget, {budget:.0f} s")
         except subprocess.CalledProcessError as error:
             said = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
             return motion_without_data("failed", said)
-        states = np.array(given["state"])
+        states = np.array(answer["state"])
         q_tree = np.array([tree.to_coordinates(state) for state in states[:, : tree.model.nq]])
-        wall, steps, rhs = given["cost"][0]
+        wall, steps, rhs = answer["cost"][0]
         return Motion("done", "", q_tree, states[:, tree.model.nq :], wall, steps=int(steps), rhs=int(rhs))
 
 
@@ -99,9 +99,9 @@ def _answer(problem: str, budget: float | None) -> Answer:
 def _problem(
     work: Work, gain: float, mu: float, iterations: int, tolerance: float, instants: Sequence[float] | Array
 ) -> str:
-    """Return a work as the numbers that the program reads, in its order; without instants only the start is told."""
+    """Return a work as the program's input; without instants the program only evaluates the start."""
     mechanism = work.mechanism
-    constraints = list(closed(mechanism))
+    constraints = list(closure_constraints(mechanism))
     q_tree, v_tree = start_of(work)
     kinds = {pin.ContactType.CONTACT_3D: 3, pin.ContactType.CONTACT_6D: 6}
     parts: list[Any] = [*_tree(mechanism), gain, len(constraints)]
@@ -130,10 +130,10 @@ def _tree(mechanism: Mechanism) -> Iterator[Any]:
 
 def _springs(mechanism: Mechanism) -> Iterator[Any]:
     springs = mechanism.springs
-    many = len(springs.stiffness)
-    yield many
-    for k in range(many):
-        for end in (k, many + k):
+    count = len(springs.stiffness)
+    yield count
+    for k in range(count):
+        for end in (k, count + k):
             yield from [springs.anchors.point_joint[end], *springs.anchors.point_local[end]]
         yield from [springs.stiffness[k], springs.rest_length[k], springs.damping[k]]
     for on_joints in (springs.joint_stiffness, springs.joint_rest, springs.joint_damping, springs.constant):
@@ -144,5 +144,5 @@ def _placed(placement: pin.SE3) -> list[float]:
     return [*placement.rotation.ravel(), *placement.translation]
 
 
-def _apart(theirs: Array, ours: Array) -> float:
+def _relative_difference(theirs: Array, ours: Array) -> float:
     return float(np.abs(theirs - ours).max() / max(float(np.abs(ours).max()), 1.0))
