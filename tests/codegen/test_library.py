@@ -16,7 +16,7 @@ from ckc_pin.codegen import library
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.parts import load_scene_mechanism
-from scripts.experiments.benchmark.growth import Case, written
+from scripts.experiments.benchmark.growth import Case, write_case
 from scripts.experiments.generated_sizes import ring
 from tests.contract.helpers.command import ckc
 
@@ -173,7 +173,7 @@ def test_compile_command_reports_whether_it_compiled(folder: Path, tmp_path: Pat
     first, again = ckc("compile", NAME, "--json"), ckc("compile", NAME, "--json")
     assert (first.code, first.json["compiled"], again.json["compiled"]) == (0, True, False)
     assert first.json["file"] == again.json["file"]
-    written(Case(80, 80), tmp_path)
+    write_case(Case(80, 80), tmp_path)
     too_large = ckc("compile", str(tmp_path / "mechanism.toml"))
     assert too_large.code == 2
     assert "161 coordinates, which move 241 joints" in too_large.err

@@ -95,7 +95,7 @@ def test_exponent_of_power_law_is_fitted(p: float, factor: float) -> None:
 @pytest.mark.parametrize(("N", "loops"), [(3, 3), (3, 1), (4, 2)])
 def test_case_has_stated_loops_and_freedoms(N: int, loops: int, tmp_path: Path) -> None:
     case = growth.Case(N, loops)
-    mechanism = prepare(load_scene(growth.written(case, tmp_path))).mechanism
+    mechanism = prepare(load_scene(growth.write_case(case, tmp_path))).mechanism
     assert (mechanism.n, mechanism.d) == (2 * N + 1, case.d)
     assert len(mechanism.spec.loop) == loops
     assert np.abs(mechanism.assembled.phi).max() < 1e-12

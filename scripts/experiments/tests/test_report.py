@@ -152,7 +152,7 @@ def test_settings_combine_all_formulations_and_methods() -> None:
     for settings in (quick, full):
         assert len({ours.name_of(setting) for setting in settings}) == len(settings)
     assert len(quick) == 4 * len(ours.QUICK_TOLERANCES)
-    assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.FEW))
+    assert len(full) == 4 * 2 * (len(ours.TOLERANCES) + len(ours.COARSE_TOLERANCES))
     assert {setting.method for setting in full} == {"auto", "DOP853", "RK45", "Radau"}
     assert {setting.overrides(scene).get("spf_coordinates") for setting in full} == {None, "w", "z"}
     for setting in full:

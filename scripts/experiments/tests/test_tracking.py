@@ -241,7 +241,7 @@ def test_controller_sigma_solves_z_within_tolerance() -> None:
     assert 1e-3 < np.abs(FIVE_BAR.phi(stale)).max() < 1e-2
     for tolerance, z_from in ((1e-2, stale), (1e-12, moved)):
         controller, start = own_sigma(tolerance)
-        assert_close(controller.sigma.keep(start.q).q_tree, FIVE_BAR.equilibrium(), 1e-12)
+        assert_close(controller.sigma.accept_step(start.q).q_tree, FIVE_BAR.equilibrium(), 1e-12)
         at = start.mechanism.kinematics(moved)
         u_tree = controller(0.3, Terms(start.mechanism, at, at.rho @ q_dot))
         assert_close(u_tree[Q], numpy_tracking(FIVE_BAR)(0.3, z_from, q_dot), 1e-10)
