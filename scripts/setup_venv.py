@@ -47,7 +47,8 @@ def main() -> None:
 def wanted_stamp() -> str:
     """Everything that .venv depends on; the place too, since a virtual environment cannot be moved."""
     packages = digest(f"{sys.version}\n{ROOT}\n", CONSTRAINTS, ROOT / "pyproject.toml", Path(__file__))
-    native = digest("", *sorted(NATIVE.iterdir()))
+    sources = sorted(path for path in NATIVE.rglob("*") if path.is_file())
+    native = digest("\n".join(path.relative_to(NATIVE).as_posix() for path in sources), *sources)
     return f"{packages}\n{native}\n"
 
 

@@ -69,7 +69,7 @@ class Effect:
     Attributes
     ----------
     kind : str
-        As `Effect` in variation.hpp.
+        As `Effect` in src/sensitivity/sensitivities.hpp.
     index : int
         Of what it is: a coordinate, a joint, a spring, a row, a motor; of a placement what is placed.
     numbers : array

@@ -1,0 +1,212 @@
+// Many members of an ensemble: one loop a thread, prepared once, each member put into it with its own numbers and start.
+//
+// A member's outcome is its own: nothing of the members before has an influence, and so neither has the number of
+// threads. Only motions that end as they should are finished here; why another one does not, Python finds out.
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <exception>
+#include <mutex>
+#include <thread>
+
+#include "bind/run.hpp"
+#include "loops/closure_solver.hpp"
+
+namespace ckc {
+
+using namespace nb::literals;
+
+namespace {
+
+using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>;
+
+constexpr const char* parts[] = {
+    "gravity", "offset", "mass", "centre", "inertia", "armature", "point", "length", "affine", "affine_offset", "end",
+    "stiffness", "rest_length", "damping", "joint_stiffness", "joint_rest", "joint_damping", "constant", "written"};
+constexpr std::int64_t not_started = -1;
+constexpr double pause = 0.05;  // s: how soon a worker sees that it is to stop
+
+struct Varied {
+  Core::Number part;
+  Numbers numbers;  // a row a member
+};
+
+struct Worker {
+  Run run;
+  Indices q, z;
+  std::unique_ptr<Closing> closing;
+  Matrix rows;  // a column an instant
+  Vector v_tree, w;
+};
+
+// What is asked of each member, and where it goes: arrays of Python's, a row a member.
+struct Task {
+  Vector base, instants;
+  Numbers q, q_dot;
+  std::vector<Varied> varied;
+  Indices columns;
+  double until;
+  Counts why, filled, work;
+  Numbers t, last, kept, met;
+  std::int64_t members;
+};
+
+Core::Number part_of(const std::string& name) {
+  const auto found = std::find_if(std::begin(parts), std::end(parts), [&](const char* part) { return name == part; });
+  require(found != std::end(parts), "varied: no " + name);
+  return static_cast<Core::Number>(found - std::begin(parts));
+}
+
+void require_shape(const Numbers& x, std::initializer_list<Eigen::Index> shape, const char* what) {
+  bool fits = x.ndim() == shape.size();
+  size_t k = 0;
+  for (Eigen::Index size : shape) fits = fits && x.shape(k++) == static_cast<size_t>(size);
+  require(fits, std::string(what) + ": an array of another shape is needed");
+}
+
+class Batch {
+ public:
+  Batch(const Batch&) = delete;
+  Batch(const nb::dict& core, const nb::dict& formulation, const nb::dict& control, const nb::dict& solver,
+        const nb::list& events, double tolerance, int threads)
+      : tolerance_(tolerance), events_(nb::len(events)) {
+    require(threads > 0, "threads: at least one is needed");
+    for (int k = 0; k < threads; ++k) {
+      auto worker = std::make_unique<Worker>();
+      prepare(worker->run, core, formulation, control, solver, events);
+      Core& own = *worker->run.core;
+      require(own.tree.roots.empty(), "a batch is of joints of one freedom");
+      worker->q = own.q, worker->z = own.z;
+      worker->closing = std::make_unique<Closing>(own);
+      worker->v_tree.setZero(own.n), worker->w.setZero(own.rows.closure.rows);
+      workers_.push_back(std::move(worker));
+    }
+  }
+
+  void run(Given base, Numbers q, Numbers q_dot, const nb::list& varied, Given instants, const Indices& columns, double until,
+           const nb::dict& out) {
+    const Core& core = *workers_[0]->run.core;
+    Task task{base, instants, q, q_dot, {}, columns, until, get<Counts>(out, "why"), get<Counts>(out, "filled"),
+              get<Counts>(out, "work"), get<Numbers>(out, "t"), get<Numbers>(out, "last"), get<Numbers>(out, "kept"),
+              get<Numbers>(out, "met"), static_cast<std::int64_t>(q.shape(0))};
+    const Eigen::Index M = task.members, width = workers_[0]->run.loop->recorder.width;
+    require(base, core.tree.nq, "base");
+    require_shape(q, {M, core.d}, "q"), require_shape(q_dot, {M, core.d}, "q_dot");
+    require_shape(task.t, {M}, "t"), require_shape(task.last, {M, width}, "last");
+    require_shape(task.kept, {M, static_cast<Eigen::Index>(columns.size()), instants.size()}, "kept");
+    require_shape(task.met, {M, static_cast<Eigen::Index>(events_)}, "met");
+    for (const Counts* x : {&task.why, &task.filled}) require(x->size() == static_cast<size_t>(M), "out: a number a member");
+    require(task.work.size() == static_cast<size_t>(3 * M), "work: three numbers a member");
+    require_indices(columns, static_cast<int>(width), "columns");
+    for (nb::handle row : varied) {
+      const auto pair = nb::cast<nb::tuple>(row);
+      const Core::Number part = part_of(nb::cast<std::string>(pair[0]));
+      task.varied.push_back({part, nb::cast<Numbers>(pair[1])});
+      require_shape(task.varied.back().numbers, {M, core.size_of(part)}, parts[static_cast<int>(part)]);
+    }
+    work(task);
+  }
+
+ private:
+  void work(const Task& task) {
+    std::atomic<std::int64_t> next{0};
+    std::atomic<bool> cancelled{false};
+    std::mutex mutex;
+    std::condition_variable ended;
+    std::exception_ptr raised;
+    size_t busy = workers_.size();
+    const auto each = [&](Worker& worker) {
+      try {
+        for (std::int64_t k; !cancelled && (k = next++) < task.members;) member(worker, task, k, cancelled);
+      } catch (...) {
+        std::lock_guard<std::mutex> lock(mutex);
+        raised = std::current_exception(), cancelled = true;
+      }
+      std::lock_guard<std::mutex> lock(mutex);
+      --busy;
+      ended.notify_one();
+    };
+    bool signalled = false;
+    {
+      nb::gil_scoped_release released;
+      std::vector<std::thread> threads;
+      for (auto& worker : workers_) threads.emplace_back(each, std::ref(*worker));
+      std::unique_lock<std::mutex> lock(mutex);
+      while (!ended.wait_for(lock, std::chrono::duration<double>(pause), [&] { return busy == 0; })) {
+        lock.unlock();
+        {
+          nb::gil_scoped_acquire acquired;
+          signalled = signalled || PyErr_CheckSignals() != 0;
+        }
+        if (signalled) cancelled = true;
+        lock.lock();
+      }
+      lock.unlock();
+      for (std::thread& thread : threads) thread.join();
+    }
+    if (signalled) throw nb::python_error();
+    if (raised) std::rethrow_exception(raised);
+  }
+
+  void member(Worker& worker, const Task& task, std::int64_t k, const std::atomic<bool>& cancelled) const {
+    Core& core = *worker.run.core;
+    Loop& loop = *worker.run.loop;
+    const auto row = [k](const Numbers& x, Eigen::Index size) {
+      return Eigen::Map<Vector>(x.data() + k * size, size);
+    };
+    task.why.data()[k] = not_started;
+    for (const Varied& varied : task.varied) core.vary(varied.part, row(varied.numbers, core.size_of(varied.part)));
+    core.split(worker.q, worker.z);
+    Closing& closing = *worker.closing;  // nothing moves: w and the start's velocity are zero
+    if (!closing.close(task.base, worker.w, tolerance_) || !closing.move(row(task.q, core.d), tolerance_)) return;
+    core.reduce();
+    core.velocity(row(task.q_dot, core.d), worker.v_tree);
+    if (!worker.v_tree.allFinite()) return;
+    const Vector start = core.q_tree;
+    const auto T = task.instants.size();
+    worker.rows.resize(loop.recorder.width, T + 1);
+    loop.start(0.0, start, worker.v_tree, worker.w);
+    loop.record(task.instants, worker.rows.data(), T + 1);
+    Stop stop;
+    do {
+      stop = loop.advance(task.until, true, pause, std::numeric_limits<double>::infinity());
+    } while (stop.why == Stop::pause && !cancelled);
+    loop.control->problem = {};
+    task.why.data()[k] = stop.why;
+    const Eigen::Index filled = loop.recorder.filled;
+    task.filled.data()[k] = filled;
+    task.t.data()[k] = loop.t();
+    const long done[] = {loop.work.rhs, loop.steps[0] + loop.steps[1] + loop.steps[2], loop.work.rejected};
+    std::copy(done, done + 3, task.work.data() + 3 * k);
+    if (!filled) return;
+    row(task.last, loop.recorder.width) = worker.rows.col(filled - 1);
+    const auto columns = static_cast<Eigen::Index>(task.columns.size());
+    for (Eigen::Index j = 0; j < columns; ++j)
+      for (Eigen::Index i = 0; i < std::min(filled, T); ++i)
+        if (worker.rows(0, i) == task.instants(i)) task.kept.data()[(k * columns + j) * T + i] = worker.rows(task.columns[j], i);
+    for (const Crossed& crossed : loop.events.met) {
+      double& first = task.met.data()[k * static_cast<Eigen::Index>(events_) + crossed.event];
+      if (!(first <= crossed.t)) first = crossed.t;
+    }
+  }
+
+  const double tolerance_;
+  const size_t events_;
+  std::vector<std::unique_ptr<Worker>> workers_;
+};
+
+}  // namespace
+
+void bind_batch(nb::module_& m) {
+  nb::list names;
+  for (int k = 0; k < static_cast<int>(Stop::raised) + 1; ++k) names.append(reasons[k]);
+  m.attr("reasons") = nb::tuple(names);
+  nb::class_<Batch>(m, "Batch")
+      .def(nb::init<const nb::dict&, const nb::dict&, const nb::dict&, const nb::dict&, const nb::list&, double, int>(),
+           "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a, "tolerance"_a, "threads"_a)
+      .def("run", &Batch::run, "base"_a, "q"_a, "q_dot"_a, "varied"_a, "instants"_a, "columns"_a, "until"_a, "out"_a);
+}
+
+}  // namespace ckc

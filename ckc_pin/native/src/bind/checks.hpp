@@ -1,0 +1,96 @@
+// What the bindings refuse: wrong sizes and numbers that are none. Nothing below them checks again.
+#pragma once
+
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <stdexcept>
+#include <string>
+
+#include "loops/core.hpp"
+
+namespace ckc {
+
+namespace nb = nanobind;
+
+using Given = nb::DRef<const Vector>;
+using Table = nb::DRef<const Matrix>;
+
+inline void require(bool holds, const std::string& says) {
+  if (!holds) throw std::invalid_argument(says);
+}
+
+inline void require(In x, Eigen::Index size, const char* what) {
+  require(x.size() == size, std::string(what) + ": " + std::to_string(size) + " numbers are needed, got " +
+                                std::to_string(x.size()));
+  require(x.allFinite(), std::string(what) + ": a number is not finite");
+}
+
+inline void require_square(const Matrix& m, Eigen::Index size, const char* what) {
+  require(m.rows() == size && m.cols() == size && m.allFinite(),
+          std::string(what) + ": a finite matrix of " + std::to_string(size) + " rows and columns is needed");
+}
+
+inline void require_indices(const Indices& at, int end, const char* what) {
+  for (int k : at)
+    require(k >= 0 && k < end, std::string(what) + ": " + std::to_string(k) + " is none of 0 to " +
+                                   std::to_string(end - 1));
+}
+
+template <class T>
+T get(const nb::dict& table, const char* key) {
+  require(table.contains(key), std::string("table: no key ") + key);
+  return nb::cast<T>(table[key]);
+}
+
+// A model as Pinocchio serializes it.
+inline std::string model_of(const nb::dict& table) {
+  const auto model = get<nb::bytes>(table, "model");
+  return {model.c_str(), model.size()};
+}
+
+// Read doubles from an array, ten times sooner than an array's way through DLPack; false where it is none of that size.
+inline bool read(nb::handle from, Out to) {
+  Py_buffer found;
+  if (PyObject_GetBuffer(from.ptr(), &found, PyBUF_STRIDES) != 0) return PyErr_Clear(), false;
+  const bool fits = found.ndim == 1 && found.shape[0] == to.size() && found.itemsize == sizeof(double);
+  const auto* data = static_cast<const char*>(found.buf);
+  for (Eigen::Index i = 0; fits && i < to.size(); ++i)
+    to(i) = *reinterpret_cast<const double*>(data + i * found.strides[0]);
+  PyBuffer_Release(&found);
+  return fits;
+}
+
+// One new array of vectors one after the other; `data` points into it.
+inline nb::object array(size_t size, double*& data) {
+  data = new double[size];
+  nb::capsule owner(data, [](void* owned) noexcept { delete[] static_cast<double*>(owned); });
+  return nb::cast(nb::ndarray<nb::numpy, double, nb::ndim<1>>(data, {size}, owner));
+}
+
+// Lists of q and z, made again only when the partition has changed.
+struct Places {
+  Indices at;
+  nb::object q, z;
+  void are(const Core& core) {
+    if (core.q != at) at = core.q, q = nb::cast(core.q), z = nb::cast(core.z);
+  }
+};
+
+// A mechanism from Python's tables; one of its terms by name.
+std::unique_ptr<Core> core_of(const nb::dict& table);
+std::unique_ptr<Written> written_of(const nb::tuple& library);  // (path, parameters)
+Closure closure_of(const nb::dict& table);
+SpringTable springs_of(const nb::dict& table);
+nb::object term_of(Core& core, const std::string& name);
+
+void bind_core(nb::module_& m);
+void bind_loop(nb::module_& m);
+void bind_gate(nb::module_& m);
+void bind_batch(nb::module_& m);
+void bind_plant(nb::module_& m);
+
+}  // namespace ckc

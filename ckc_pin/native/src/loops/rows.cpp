@@ -1,0 +1,222 @@
+#include "loops/rows.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <set>
+
+#include "tree/rotation.hpp"
+
+namespace ckc {
+
+namespace {
+
+Vector6 force(const Vector3& at, const Vector3& along) {
+  Vector6 w;
+  w << along, at.cross(along);
+  return w;
+}
+
+// The rate of `force`.
+Vector6 force_rate(const Vector3& at, const Vector3& along, const Vector3& at_dot, const Vector3& along_dot) {
+  Vector6 w;
+  w << along_dot, at_dot.cross(along) + at.cross(along_dot);
+  return w;
+}
+
+Vector6 torque(const Vector3& about) {
+  Vector6 w;
+  w << Vector3::Zero(), about;
+  return w;
+}
+
+}  // namespace
+
+Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
+  const Closure& c = closure;
+  pairs_ = static_cast<int>(c.point_joint.size()) / 2;
+  p_.resize(2 * pairs_), p_dot_.resize(2 * pairs_), r_.resize(pairs_), r_dot_.resize(pairs_);
+  e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
+  velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
+  wrenches_.resize(c.rows), pattern.resize(c.rows);
+  const auto joints = [&](int out, std::initializer_list<int> list) {
+    for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
+  };
+  for (const auto& row : c.components)
+    joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair], c.direction_joint[row.direction]});
+  for (const auto& row : c.dots) joints(row.out, {c.direction_joint[row.a], c.direction_joint[row.b]});
+  for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair]});
+  for (const auto& rows : c.logs)
+    for (int out : rows.out) joints(out, {rows.joint_a, rows.joint_b});
+  std::set<int> used(c.point_joint.begin(), c.point_joint.end());
+  used.insert(c.direction_joint.begin(), c.direction_joint.end());
+  for (const auto& rows : c.logs) used.insert(rows.joint_a), used.insert(rows.joint_b);
+  used.erase(0);  // the world does not move
+  joints_.assign(used.begin(), used.end());
+  phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
+  for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
+  for (int i = 0; i < c.rows; ++i) {
+    std::set<int> columns;
+    for (const auto& wrench : wrenches_[i]) {
+      const auto& support = tree.support[wrench.joint];
+      columns.insert(support.begin(), support.end());
+    }
+    for (int j = 0; j < tree.n; ++j)
+      if (J(i, j) != 0.0) columns.insert(j);
+    pattern[i].assign(columns.begin(), columns.end());
+  }
+}
+
+void Rows::vary(Number what, In numbers) {
+  if (what == Number::point)
+    for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = numbers.segment<3>(3 * k);
+  if (what == Number::length)
+    for (auto& row : closure.distances) row.length = numbers(row.out);
+  const auto n = J.cols();
+  for (auto& row : closure.affine) {
+    if (what == Number::affine) row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (what == Number::affine_offset) row.offset = numbers(row.out);
+  }
+}
+
+void Rows::set(const Tree& tree, In q) {
+  const Closure& c = closure;
+  for (size_t k = 0; k < p_.size(); ++k)
+    p_[k] = tree.rotation(c.point_joint[k]) * c.point_local[k] + tree.translation(c.point_joint[k]);
+  for (int k = 0; k < pairs_; ++k) r_[k] = p_[k] - p_[pairs_ + k];
+  for (size_t k = 0; k < e_.size(); ++k) e_[k] = tree.rotation(c.direction_joint[k]) * c.direction_local[k];
+  for (const auto& row : c.components) {
+    const Vector3 &e = e_[row.direction], &r = r_[row.pair];
+    auto& w = wrenches_[row.out];
+    phi(row.out) = e.dot(r);
+    w[0].w = force(p_[row.pair], e);
+    w[1].w = -force(p_[pairs_ + row.pair], e);
+    if (w[2].joint) w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
+  }
+  for (const auto& row : c.dots) {
+    auto& w = wrenches_[row.out];
+    phi(row.out) = e_[row.a].dot(e_[row.b]);
+    w[0].w = torque(e_[row.a].cross(e_[row.b]));
+    w[1].w = -w[0].w;
+  }
+  for (const auto& row : c.distances) {
+    const Vector3 along = r_[row.pair] / row.length;
+    auto& w = wrenches_[row.out];
+    phi(row.out) = (r_[row.pair].squaredNorm() - row.length * row.length) / (2 * row.length);
+    w[0].w = force(p_[row.pair], along);
+    w[1].w = -force(p_[pairs_ + row.pair], along);
+  }
+  for (const auto& row : c.affine) {
+    double value = -row.offset;
+    for (int j : pattern[row.out]) value += row.coefficients(j) * q(tree.place[j]);
+    phi(row.out) = value;
+  }
+  relative(tree);
+}
+
+void Rows::relative(const Tree& tree) {
+  for (const auto& rows : closure.logs) {
+    const Matrix3 r_a = tree.rotation(rows.joint_a) * rows.rotation_a;
+    const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
+    const Vector3 u = log3(r_a.transpose() * r_b);
+    const Matrix3 m = LogRate(u).value * r_b.transpose();
+    for (int k = 0; k < 3; ++k) {
+      auto& w = wrenches_[rows.out[k]];
+      phi(rows.out[k]) = u(k);
+      w[1].w = torque(m.row(k));
+      w[0].w = -w[1].w;
+    }
+  }
+}
+
+void Rows::rates(const Tree& tree) {
+  const Closure& c = closure;
+  for (int joint : joints_) velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.acceleration(joint);
+  for (size_t k = 0; k < p_.size(); ++k) {
+    const Vector6& v = velocity_[c.point_joint[k]];
+    p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);
+  }
+  for (int k = 0; k < pairs_; ++k) r_dot_[k] = p_dot_[k] - p_dot_[pairs_ + k];
+  for (size_t k = 0; k < e_.size(); ++k)
+    e_dot_[k] = Vector3(velocity_[c.direction_joint[k]].tail<3>()).cross(e_[k]);
+  for (const auto& row : c.components) {
+    const int a = row.pair, b = pairs_ + row.pair;
+    const Vector3 &e = e_[row.direction], &e_dot = e_dot_[row.direction];
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = force_rate(p_[a], e, p_dot_[a], e_dot);
+    w[1].w_dot = -force_rate(p_[b], e, p_dot_[b], e_dot);
+    if (w[2].joint) w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
+  }
+  for (const auto& row : c.dots) {
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = torque(e_dot_[row.a].cross(e_[row.b]) + e_[row.a].cross(e_dot_[row.b]));
+    w[1].w_dot = -w[0].w_dot;
+  }
+  for (const auto& row : c.distances) {
+    const int a = row.pair, b = pairs_ + row.pair;
+    const Vector3 along = r_[row.pair] / row.length, along_dot = r_dot_[row.pair] / row.length;
+    auto& w = wrenches_[row.out];
+    w[0].w_dot = force_rate(p_[a], along, p_dot_[a], along_dot);
+    w[1].w_dot = -force_rate(p_[b], along, p_dot_[b], along_dot);
+  }
+  relative_rates(tree);
+}
+
+void Rows::relative_rates(const Tree& tree) {
+  for (const auto& rows : closure.logs) {
+    const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
+    const Vector3 omega_b = velocity_[rows.joint_b].tail<3>();
+    const Vector3 omega = omega_b - velocity_[rows.joint_a].tail<3>();
+    Vector3 u;
+    for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
+    const LogRate j_log(u);
+    const Vector3 u_dot = j_log.value * (r_b.transpose() * omega);
+    // d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
+    const Matrix3 m_dot = j_log.along(u_dot) * r_b.transpose() - j_log.value * r_b.transpose() * skew(omega_b);
+    for (int k = 0; k < 3; ++k) {
+      auto& w = wrenches_[rows.out[k]];
+      w[1].w_dot = torque(m_dot.row(k));
+      w[0].w_dot = -w[1].w_dot;
+    }
+  }
+}
+
+void Rows::jacobian(const Tree& tree) {
+  const Matrix6x& columns = tree.jacobian();
+  for (int i = 0; i < closure.rows; ++i) {
+    if (wrenches_[i].empty()) continue;  // affine: it stays as it is
+    for (int j : pattern[i]) J(i, j) = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      for (int j : tree.support[wrench.joint]) J(i, j) += wrench.w.dot(columns.col(j));
+  }
+}
+
+void Rows::jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
+  const Matrix6x& columns = tree.jacobian();
+  for (int i = 0; i < closure.rows; ++i) {
+    for (int j : pattern[i]) J_dot(i, j) = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      for (int j : tree.support[wrench.joint])
+        J_dot(i, j) += wrench.w.dot(columns_dot.col(j)) + wrench.w_dot.dot(columns.col(j));
+  }
+}
+
+void Rows::bias(Out J_dot_v) const {
+  for (int i = 0; i < closure.rows; ++i) {
+    double value = 0.0;
+    for (const auto& wrench : wrenches_[i])
+      if (wrench.joint) value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
+    J_dot_v(i) = value;
+  }
+}
+
+std::vector<Indices> Rows::pattern_of(const Indices& columns, int n) const {
+  Indices at(n, -1);
+  for (size_t j = 0; j < columns.size(); ++j) at[columns[j]] = static_cast<int>(j);
+  std::vector<Indices> found(closure.rows);
+  for (int i = 0; i < closure.rows; ++i)
+    for (int j : pattern[i])
+      if (at[j] >= 0) found[i].push_back(at[j]);
+  return found;
+}
+
+}  // namespace ckc

@@ -1,0 +1,226 @@
+#include "tree/linear.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <utility>
+
+namespace ckc {
+
+constexpr int few = 6;  // rows, which to take as they are costs less than to look where their entries are
+
+void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
+  rows_ = rows, columns_ = columns, pattern_ = pattern, small_ = rows == columns && rows <= few;
+  Indices first(columns, rows);
+  for (int i = rows - 1; i >= 0; --i)
+    for (int j : pattern[i]) first[j] = i;
+  column_at_.resize(columns), place_of_.resize(columns);
+  std::iota(column_at_.begin(), column_at_.end(), 0);
+  std::stable_sort(column_at_.begin(), column_at_.end(), [&](int a, int b) { return first[a] < first[b]; });
+  for (int k = 0; k < columns; ++k) place_of_[column_at_[k]] = k;
+  work_.setZero(std::max(rows, columns));
+  if (rows == columns) {
+    lu_.setZero(rows, columns);
+    high_.assign(rows, 0), row_at_.resize(rows), below_.resize(rows), beginning_.assign(rows, {});
+    for (auto& touched : below_) touched.reserve(rows);
+    active_.reserve(rows);
+    for (int i = 0; i < rows; ++i) {
+      int low = rows;
+      for (int j : pattern[i]) low = std::min(low, place_of_[j]);
+      if (low < rows) beginning_[low].push_back(i);
+    }
+  } else {
+    qr_.setZero(rows, columns);
+    tau_.setZero(columns);
+  }
+}
+
+void Factor::compute(const Matrix& a, const Indices& columns) {
+  const auto at = [&](int j) { return columns.empty() ? j : columns[j]; };
+  singular_ = false;
+  if (rows_ != columns_) {
+    for (int j = 0; j < columns_; ++j) qr_.col(j) = a.col(at(j));
+    return householder();
+  }
+  if (small_) {
+    for (int i = 0; i < rows_; ++i)
+      for (int k = 0; k < rows_; ++k) lu_(i, k) = a(i, at(column_at_[k]));
+    return eliminate_small();
+  }
+  for (int i = 0; i < rows_; ++i) {
+    lu_.row(i).head(high_[i]).setZero();  // what the last time left
+    high_[i] = 0;
+    for (int j : pattern_[i]) {
+      const int k = place_of_[j];
+      lu_(i, k) = a(i, at(j));
+      high_[i] = std::max(high_[i], k + 1);
+    }
+  }
+  eliminate();
+}
+
+void Definite::shape(int size) {
+  few_ = size <= few;
+  if (few_)
+    small_.shape(size, size, full_pattern(size));
+  else
+    large_.compute(Matrix::Identity(size, size));  // used once, before anything can move it
+}
+
+void Definite::compute(const Matrix& a) { few_ ? small_.compute(a) : void(large_.compute(a)); }
+
+void Definite::solve(In b, Out x) {
+  if (few_) return small_.solve(b, x);
+  x = b;
+  large_.matrixL().solveInPlace(x);
+  large_.matrixU().solveInPlace(x);
+}
+
+std::vector<Indices> full_pattern(int size) {
+  Indices every(size);
+  std::iota(every.begin(), every.end(), 0);
+  return std::vector<Indices>(size, every);
+}
+
+void Factor::eliminate() {
+  active_.clear();
+  for (int k = 0; k < rows_; ++k) {
+    active_.insert(active_.end(), beginning_[k].begin(), beginning_[k].end());
+    size_t best = 0;
+    double largest = -1.0;
+    for (size_t i = 0; i < active_.size(); ++i) {
+      const double size = std::abs(lu_(active_[i], k));
+      if (size > largest || std::isnan(size)) largest = size, best = i;
+    }
+    if (!(largest > 0.0)) singular_ = true;
+    below_[k].clear();
+    if (active_.empty()) {  // by its pattern alone
+      row_at_[k] = k;
+      continue;
+    }
+    const int pivot = active_[best], end = high_[pivot];
+    active_.erase(active_.begin() + static_cast<std::ptrdiff_t>(best));
+    row_at_[k] = pivot;
+    const double diagonal = lu_(pivot, k);
+    for (int row : active_) {
+      if (lu_(row, k) == 0.0) continue;
+      const double factor = lu_(row, k) / diagonal;
+      lu_(row, k) = factor;
+      for (int j = k + 1; j < end; ++j) lu_(row, j) -= factor * lu_(pivot, j);
+      high_[row] = std::max(high_[row], end);
+      below_[k].push_back(row);
+    }
+  }
+}
+
+void Factor::eliminate_small() {
+  const int n = rows_;
+  std::iota(row_at_.begin(), row_at_.end(), 0);
+  for (int k = 0; k < n; ++k) {
+    int best = k;
+    double largest = -1.0;
+    for (int i = k; i < n; ++i) {
+      const double size = std::abs(lu_(row_at_[i], k));
+      if (size > largest || std::isnan(size)) largest = size, best = i;
+    }
+    if (!(largest > 0.0)) singular_ = true;
+    std::swap(row_at_[k], row_at_[best]);
+    const double* pivot = &lu_(row_at_[k], 0);
+    for (int i = k + 1; i < n; ++i) {
+      double* row = &lu_(row_at_[i], 0);
+      row[k] /= pivot[k];
+      for (int j = k + 1; j < n; ++j) row[j] -= row[k] * pivot[j];
+    }
+  }
+}
+
+double Factor::pivot_ratio() const {
+  double least = std::numeric_limits<double>::infinity(), most = 0.0;
+  for (int k = 0; k < columns_; ++k) {
+    const double pivot = std::abs(rows_ == columns_ ? lu_(row_at_[k], k) : qr_(k, k));
+    least = std::min(least, pivot), most = std::max(most, pivot);
+  }
+  return columns_ ? least / most : 1.0;
+}
+
+void Factor::householder() {
+  for (int k = 0; k < columns_; ++k) {
+    auto x = qr_.col(k).tail(rows_ - k);
+    const double norm = x.norm(), beta = x(0) > 0.0 ? -norm : norm;
+    if (!(norm > 0.0)) {
+      singular_ = true;
+      tau_(k) = 0.0;
+      continue;
+    }
+    tau_(k) = (beta - x(0)) / beta;
+    x.tail(rows_ - k - 1) /= x(0) - beta;
+    x(0) = beta;
+    for (int j = k + 1; j < columns_; ++j) {
+      auto y = qr_.col(j).tail(rows_ - k);
+      const auto v = x.tail(rows_ - k - 1);
+      const double along = tau_(k) * (y(0) + v.dot(y.tail(rows_ - k - 1)));
+      y(0) -= along;
+      y.tail(rows_ - k - 1) -= along * v;
+    }
+  }
+}
+
+void Factor::solve(In b, Out x) {
+  if (rows_ != columns_) {
+    work_.head(rows_) = b;
+    for (int k = 0; k < columns_; ++k) {
+      const auto v = qr_.col(k).tail(rows_ - k - 1);
+      const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+      work_(k) -= along;
+      work_.segment(k + 1, rows_ - k - 1) -= along * v;
+    }
+    for (int k = columns_ - 1; k >= 0; --k) {
+      const int rest = columns_ - k - 1;
+      work_(k) = (work_(k) - qr_.row(k).tail(rest).dot(work_.segment(k + 1, rest))) / qr_(k, k);
+    }
+    x = work_.head(columns_);
+    return;
+  }
+  if (small_) {
+    for (int k = 0; k < rows_; ++k) {
+      const double* row = &lu_(row_at_[k], 0);
+      double value = b(row_at_[k]);
+      for (int j = 0; j < k; ++j) value -= row[j] * work_(j);
+      work_(k) = value;
+    }
+    for (int k = rows_ - 1; k >= 0; --k) {
+      const double* row = &lu_(row_at_[k], 0);
+      double value = work_(k);
+      for (int j = k + 1; j < rows_; ++j) value -= row[j] * x(column_at_[j]);
+      x(column_at_[k]) = value / row[k];
+    }
+    return;
+  }
+  work_.head(rows_) = b;
+  for (int k = 0; k < rows_; ++k) {
+    const double value = work_(row_at_[k]);
+    for (int row : below_[k]) work_(row) -= lu_(row, k) * value;
+  }
+  for (int k = rows_ - 1; k >= 0; --k) {
+    const int row = row_at_[k];
+    double value = work_(row);
+    for (int j = k + 1; j < high_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
+    x(column_at_[k]) = value / lu_(row, k);
+  }
+}
+
+void Factor::solve_transposed(In b, Out x) {
+  work_.setZero();
+  for (int k = 0; k < columns_; ++k)
+    work_(k) = (b(k) - qr_.col(k).head(k).dot(work_.head(k))) / qr_(k, k);
+  for (int k = columns_ - 1; k >= 0; --k) {
+    const auto v = qr_.col(k).tail(rows_ - k - 1);
+    const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+    work_(k) -= along;
+    work_.segment(k + 1, rows_ - k - 1) -= along * v;
+  }
+  x = work_.head(rows_);
+}
+
+}  // namespace ckc

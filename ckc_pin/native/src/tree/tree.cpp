@@ -1,0 +1,273 @@
+#include "tree/tree.hpp"
+
+#include <pinocchio/algorithm/crba.hpp>
+#include <pinocchio/algorithm/energy.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/rnea-derivatives.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
+#include <pinocchio/multibody.hpp>
+#include <pinocchio/serialization.hpp>
+#include <pinocchio/spatial.hpp>
+
+#include <algorithm>
+#include <cmath>
+
+#include "tree/rotation.hpp"
+
+namespace ckc {
+
+namespace pin = pinocchio;
+
+struct Tree::Workspace {
+  pin::Model model;
+  pin::Data data;
+  explicit Workspace(pin::Model&& given) : model(std::move(given)), data(model) {}
+};
+
+static pin::Model read(const std::string& serialized) {
+  pin::Model model;
+  boost::asio::streambuf buffer;
+  buffer.sputn(serialized.data(), static_cast<std::streamsize>(serialized.size()));
+  pin::serialization::loadFromBinary(model, buffer);
+  return model;
+}
+
+Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(place_)) {
+  own = std::make_unique<Workspace>(read(serialized));
+  const pin::Model& model = own->model;
+  n = model.nv, nq = model.nq, joints = model.njoints;
+  support.resize(joints);
+  ancestors.resize(n), joint_of.resize(n), parent.assign(model.parents.begin(), model.parents.end());
+  for (int joint = 1; joint < joints; ++joint) {
+    if (model.nqs[joint] == 7)
+      roots.push_back({model.idx_qs[joint], model.idx_vs[joint]});
+    else
+      single.push_back(model.idx_vs[joint]);
+    support[joint] = support[model.parents[joint]];
+    for (int k = model.idx_vs[joint]; k < model.idx_vs[joint] + model.nvs[joint]; ++k) {
+      support[joint].push_back(k);
+      joint_of[k] = joint;
+      ancestors[k] = support[joint];
+    }
+  }
+}
+
+Tree::~Tree() = default;
+
+void Tree::vary(Number what, In numbers) {
+  pin::Model& model = own->model;
+  const auto three = [&](int joint) { return Vector3(numbers.segment<3>(3 * joint)); };
+  if (what == Number::gravity) model.gravity.linear() = three(0);
+  if (what == Number::armature) model.armature = numbers;
+  for (int joint = 0; joint < joints; ++joint) {
+    pin::Inertia& body = model.inertias[joint];
+    if (what == Number::offset) model.jointPlacements[joint].translation() = three(joint);
+    if (what == Number::mass) body.mass() = numbers(joint);
+    if (what == Number::centre) body.lever() = three(joint);
+    if (what == Number::inertia) body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
+  }
+}
+
+void Tree::set(In q) { pin::computeJointJacobians(own->model, own->data, q); }
+
+const Matrix6x& Tree::jacobian() const { return own->data.J; }
+
+Matrix3 Tree::rotation(int joint) const { return own->data.oMi[joint].rotation(); }
+
+Vector3 Tree::translation(int joint) const { return own->data.oMi[joint].translation(); }
+
+void Tree::inertia(In q) { pin::crba(own->model, own->data, q, pin::Convention::WORLD); }
+
+const Matrix& Tree::D() const { return own->data.M; }
+
+const Vector& Tree::bias(In q, In v) { return pin::nonLinearEffects(own->model, own->data, q, v); }
+
+Vector6 Tree::velocity(int joint) const { return own->data.oMi[joint].act(own->data.v[joint]).toVector(); }
+
+Vector6 Tree::acceleration(int joint) const {
+  // nonLinearEffects lets the world fall upwards instead of the bodies down
+  return own->data.oMi[joint].act(own->data.a_gf[joint]).toVector() + own->model.gravity.toVector();
+}
+
+const Vector& Tree::gravity(In q) { return pin::computeGeneralizedGravity(own->model, own->data, q); }
+
+const Matrix& Tree::coriolis(In q, In v) { return pin::computeCoriolisMatrix(own->model, own->data, q, v); }
+
+const Matrix6x& Tree::jacobian_dot() const { return own->data.dJ; }
+
+const Matrix6x& Tree::jacobian_rate(In q, In v) {
+  return pin::computeJointJacobiansTimeVariation(own->model, own->data, q, v);
+}
+
+double Tree::potential_energy(In q) { return pin::computePotentialEnergy(own->model, own->data, q); }
+
+void Tree::derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
+  pin::Model& model = own->model;
+  pin::Data& data = own->data;
+  pin::computeRNEADerivatives(model, data, q, v, a);
+  by_q = data.dtau_dq, by_v = data.dtau_dv;
+  if (gravity) return;  // placements, motions and the Jacobian are those there
+  Matrix of_gravity = Matrix::Zero(n, n);
+  pin::computeGeneralizedGravityDerivatives(model, data, q, of_gravity);
+  by_q -= of_gravity;
+  pin::forwardKinematics(model, data, q, v, a);
+  set(q);
+}
+
+Vector6 Tree::motion(int joint) const { return velocity(joint); }
+
+Vector6 Tree::motion_rate(int joint) const { return own->data.oMi[joint].act(own->data.a[joint]).toVector(); }
+
+Matrix6 Tree::spatial_inertia(int joint) const {
+  return joint ? own->data.oMi[joint].act(own->model.inertias[joint]).matrix() : Matrix6(Matrix6::Zero());
+}
+
+Tree::Body Tree::body(int joint) const {
+  const pin::Inertia there = own->data.oMi[joint].act(own->model.inertias[joint]);
+  return {there.mass(), there.lever(), there.inertia().matrix()};
+}
+
+const Vector& Tree::armature() const { return own->model.armature; }
+
+Vector6 Tree::field() const { return own->model.gravity.toVector(); }
+
+static Eigen::Quaterniond turned(In q, Tree::Root root) {
+  return Eigen::Quaterniond(Eigen::Vector4d(q.segment<4>(root.q + 3))).normalized();
+}
+
+static pin::SE3 placement(In q, Tree::Root root) {
+  return {turned(q, root).toRotationMatrix(), q.segment<3>(root.q)};
+}
+
+void Tree::normalize(Out q) const {
+  for (const Root& root : roots) q.segment<4>(root.q + 3).normalize();
+}
+
+void Tree::integrate(Out q, In step) const {
+  for (int k : single) q(place[k]) += step(k);
+  for (const Root& root : roots) {
+    const pin::SE3 there = placement(q, root) * pin::exp6(pin::Motion(step.segment<6>(root.v)));
+    Eigen::Quaterniond turn(there.rotation());
+    turn.normalize();
+    if (turn.dot(turned(q, root)) < 0) turn.coeffs() *= -1;  // of the two that mean the same the nearer one
+    q.segment<3>(root.q) = there.translation();
+    q.segment<4>(root.q + 3) = turn.coeffs();
+  }
+}
+
+void Tree::difference(In from, In to, Out step) const {
+  for (int k : single) step(k) = to(place[k]) - from(place[k]);
+  for (const Root& root : roots)
+    step.segment<6>(root.v) = pin::log6(placement(from, root).actInv(placement(to, root))).toVector();
+}
+
+void Tree::difference_rate(In from, In to, In v, Out rate) const {
+  rate = v;
+  for (const Root& root : roots)
+    rate.segment<6>(root.v) = pin::Jlog6(placement(from, root).actInv(placement(to, root))) * v.segment<6>(root.v);
+}
+
+void Tree::configuration_rate(In q, In v, Out q_dot) const {
+  for (int k : single) q_dot(place[k]) = v(k);
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    Eigen::Quaterniond spin;  // half the angular velocity in the body's axes
+    spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
+    q_dot.segment<3>(root.q) = turn * Vector3(v.segment<3>(root.v));
+    q_dot.segment<4>(root.q + 3) = (turn * spin).coeffs();
+  }
+}
+
+// That of `ckc_pin.mechanism.tree`.
+double Tree::coarseness(In q, In units) const {
+  constexpr double many = 100.0, most = 1e4;
+  double largest = 0.0;
+  for (int k : single) largest = std::max(largest, std::abs(q(place[k])) / units(k));
+  for (const Root& root : roots) largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
+  return std::clamp(largest / many, 1.0, most);
+}
+
+Matrix Tree::tangents(In q) const {
+  Matrix found = Matrix::Zero(n, nq);
+  for (int k : single) found(k, place[k]) = 1.0;
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    const double size = q.segment<4>(root.q + 3).norm();
+    found.block<3, 3>(root.v, root.q) = turn.toRotationMatrix().transpose();
+    for (int k = 0; k < 4; ++k) {  // twice the vector part of conj(turn) times the change
+      Eigen::Quaterniond change(0, 0, 0, 0);
+      change.coeffs()(k) = 1.0;
+      found.block<3, 1>(root.v + 3, root.q + 3 + k) = 2.0 / size * (turn.conjugate() * change).vec();
+    }
+  }
+  return found;
+}
+
+Matrix Tree::rate_changes(In q, In v) const {
+  Matrix found = Matrix::Zero(nq, n);
+  for (const Root& root : roots) {
+    const Eigen::Quaterniond turn = turned(q, root);
+    Eigen::Quaterniond half, spin;
+    spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
+    for (int k = 0; k < 3; ++k) {
+      half.w() = 0.0, half.vec() = 0.5 * Vector3::Unit(k);
+      found.block<3, 1>(root.q, root.v + 3 + k) = turn * Vector3(Vector3::Unit(k).cross(Vector3(v.segment<3>(root.v))));
+      found.block<4, 1>(root.q + 3, root.v + 3 + k) = (turn * half * spin).coeffs();
+    }
+  }
+  return found;
+}
+
+void Tree::add_bracket(In v, In x, Out sum) const {
+  for (const Root& root : roots) {
+    const Vector3 slide = v.segment<3>(root.v), spin = v.segment<3>(root.v + 3);
+    const Vector3 moved = x.segment<3>(root.v), turned = x.segment<3>(root.v + 3);
+    sum.segment<3>(root.v) += spin.cross(moved) + slide.cross(turned);
+    sum.segment<3>(root.v + 3) += spin.cross(turned);
+  }
+}
+
+Matrix Tree::brackets(In v) const {
+  Matrix found = Matrix::Zero(n, n);
+  for (const Root& root : roots)
+    for (int k = root.v; k < root.v + 6; ++k) add_bracket(v, Vector::Unit(n, k), found.col(k));
+  return found;
+}
+
+Matrix3 Tree::orientation(In q, Root root) const { return turned(q, root).toRotationMatrix(); }
+
+Vector6 Tree::twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const {
+  return pin::log6(placement(q, root).actInv(pin::SE3(orientation, position))).toVector();
+}
+
+void Tree::to_coordinates(In q, Out numbers) const {
+  for (int k : single) numbers(k) = q(place[k]);
+  for (const Root& root : roots) {
+    numbers.segment<3>(root.v) = q.segment<3>(root.q);
+    numbers.segment<3>(root.v + 3) = pin::log3(turned(q, root).toRotationMatrix());
+  }
+}
+
+double Tree::coordinate_step(In q, int k, In step) const {
+  for (const Root& root : roots) {
+    if (k < root.v || k >= root.v + 6) continue;
+    const Matrix3 turn = turned(q, root).toRotationMatrix();
+    const int row = k - root.v;
+    return row < 3 ? turn.row(row).dot(step.segment<3>(root.v)) : Jlog3(turn).row(row - 3).dot(step.segment<3>(root.v + 3));
+  }
+  return step(k);
+}
+
+Vector3 log3(const Matrix3& rotation) { return pin::log3(rotation); }
+
+Matrix3 exp3(const Vector3& vector) { return pin::exp3(vector); }
+
+Matrix3 Jlog3(const Matrix3& rotation) {
+  Matrix3 j;
+  pin::Jlog3(rotation, j);
+  return j;
+}
+
+std::string pinocchio_version() { return PINOCCHIO_VERSION; }
+
+}  // namespace ckc
