@@ -1,7 +1,8 @@
-// Many members of an ensemble: one loop a thread, prepared once, each member put into it with its own numbers and start.
+// Simulates the members of an ensemble: one loop per thread, prepared once, then restarted with each member's
+// parameters and initial state.
 //
-// A member's outcome is its own: nothing of the members before has an influence, and so neither has the number of
-// threads. Only motions that end as they should are finished here; why another one does not, Python finds out.
+// The result of a member depends neither on the members before it nor on the number of threads. If a member stops
+// early, Python repeats it to find out why.
 #include <algorithm>
 #include <atomic>
 #include <chrono>
@@ -22,30 +23,31 @@ namespace {
 using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>;
 
-constexpr const char* parts[] = {
-    "gravity", "offset", "mass", "centre", "inertia", "armature", "point", "length", "affine", "affine_offset", "end",
-    "stiffness", "rest_length", "damping", "joint_stiffness", "joint_rest", "joint_damping", "constant", "written"};
+constexpr const char* parameter_names[] = {"gravity",    "offset",        "mass",        "centre",  "inertia",
+                                           "armature",   "point",         "length",      "affine",  "affine_offset",
+                                           "end",        "stiffness",     "rest_length", "damping", "joint_stiffness",
+                                           "joint_rest", "joint_damping", "constant",    "written"};
 constexpr std::int64_t not_started = -1;
-constexpr double pause = 0.05;  // s: how soon a worker sees that it is to stop
+constexpr double pause = 0.05;  // s, until a worker notices that it should stop
 
-struct Varied {
-  Core::Number part;
-  Numbers numbers;  // a row a member
+struct ParameterColumns {
+  Core::Parameter part;
+  Numbers numbers;  // one row per member
 };
 
 struct Worker {
-  Run run;
+  Loop loop;
   Indices q, z;
-  std::unique_ptr<Closing> closing;
-  Matrix rows;  // a column an instant
+  std::unique_ptr<ClosureSolver> closure_solver;
+  Matrix rows;  // one column per instant
   Vector v_tree, w;
 };
 
-// What is asked of each member, and where it goes: arrays of Python's, a row a member.
+// What to compute for each member, and Python's arrays for the results, one row per member.
 struct Task {
   Vector base, instants;
   Numbers q, q_dot;
-  std::vector<Varied> varied;
+  std::vector<ParameterColumns> parameter_columns;
   Indices columns;
   double until;
   Counts why, filled, work;
@@ -53,10 +55,11 @@ struct Task {
   std::int64_t members;
 };
 
-Core::Number part_of(const std::string& name) {
-  const auto found = std::find_if(std::begin(parts), std::end(parts), [&](const char* part) { return name == part; });
-  require(found != std::end(parts), "varied: no " + name);
-  return static_cast<Core::Number>(found - std::begin(parts));
+Core::Parameter parameter_from_name(const std::string& name) {
+  const auto found = std::find_if(std::begin(parameter_names), std::end(parameter_names),
+                                  [&](const char* part) { return name == part; });
+  require(found != std::end(parameter_names), "varied: no " + name);
+  return static_cast<Core::Parameter>(found - std::begin(parameter_names));
 }
 
 void require_shape(const Numbers& x, std::initializer_list<Eigen::Index> shape, const char* what) {
@@ -75,36 +78,50 @@ class Batch {
     require(threads > 0, "threads: at least one is needed");
     for (int k = 0; k < threads; ++k) {
       auto worker = std::make_unique<Worker>();
-      prepare(worker->run, core, formulation, control, solver, events);
-      Core& own = *worker->run.core;
+      prepare(worker->loop, core, formulation, control, solver, events);
+      Core& own = *worker->loop.core;
       require(own.tree.roots.empty(), "a batch is of joints of one freedom");
       worker->q = own.q, worker->z = own.z;
-      worker->closing = std::make_unique<Closing>(own);
-      worker->v_tree.setZero(own.n), worker->w.setZero(own.rows.closure.rows);
+      worker->closure_solver = std::make_unique<ClosureSolver>(own);
+      worker->v_tree.setZero(own.n), worker->w.setZero(own.constraints.closure.rows);
       workers_.push_back(std::move(worker));
     }
   }
 
-  void run(Given base, Numbers q, Numbers q_dot, const nb::list& varied, Given instants, const Indices& columns, double until,
-           const nb::dict& out) {
-    const Core& core = *workers_[0]->run.core;
-    Task task{base, instants, q, q_dot, {}, columns, until, get<Counts>(out, "why"), get<Counts>(out, "filled"),
-              get<Counts>(out, "work"), get<Numbers>(out, "t"), get<Numbers>(out, "last"), get<Numbers>(out, "kept"),
-              get<Numbers>(out, "met"), static_cast<std::int64_t>(q.shape(0))};
-    const Eigen::Index M = task.members, width = workers_[0]->run.loop->recorder.width;
+  void run(Given base, Numbers q, Numbers q_dot, const nb::list& parameter_columns, Given instants,
+           const Indices& columns, double until, const nb::dict& out) {
+    const Core& core = *workers_[0]->loop.core;
+    Task task{base,
+              instants,
+              q,
+              q_dot,
+              {},
+              columns,
+              until,
+              get<Counts>(out, "why"),
+              get<Counts>(out, "filled"),
+              get<Counts>(out, "work"),
+              get<Numbers>(out, "t"),
+              get<Numbers>(out, "last"),
+              get<Numbers>(out, "kept"),
+              get<Numbers>(out, "met"),
+              static_cast<std::int64_t>(q.shape(0))};
+    const Eigen::Index M = task.members, width = workers_[0]->loop.step_loop->recorder.width;
     require(base, core.tree.nq, "base");
     require_shape(q, {M, core.d}, "q"), require_shape(q_dot, {M, core.d}, "q_dot");
     require_shape(task.t, {M}, "t"), require_shape(task.last, {M, width}, "last");
     require_shape(task.kept, {M, static_cast<Eigen::Index>(columns.size()), instants.size()}, "kept");
     require_shape(task.met, {M, static_cast<Eigen::Index>(events_)}, "met");
-    for (const Counts* x : {&task.why, &task.filled}) require(x->size() == static_cast<size_t>(M), "out: a number a member");
+    for (const Counts* x : {&task.why, &task.filled})
+      require(x->size() == static_cast<size_t>(M), "out: a number a member");
     require(task.work.size() == static_cast<size_t>(3 * M), "work: three numbers a member");
     require_indices(columns, static_cast<int>(width), "columns");
-    for (nb::handle row : varied) {
+    for (nb::handle row : parameter_columns) {
       const auto pair = nb::cast<nb::tuple>(row);
-      const Core::Number part = part_of(nb::cast<std::string>(pair[0]));
-      task.varied.push_back({part, nb::cast<Numbers>(pair[1])});
-      require_shape(task.varied.back().numbers, {M, core.size_of(part)}, parts[static_cast<int>(part)]);
+      const Core::Parameter part = parameter_from_name(nb::cast<std::string>(pair[0]));
+      task.parameter_columns.push_back({part, nb::cast<Numbers>(pair[1])});
+      require_shape(task.parameter_columns.back().numbers, {M, core.parameter_size(part)},
+                    parameter_names[static_cast<int>(part)]);
     }
     work(task);
   }
@@ -151,42 +168,46 @@ class Batch {
   }
 
   void member(Worker& worker, const Task& task, std::int64_t k, const std::atomic<bool>& cancelled) const {
-    Core& core = *worker.run.core;
-    Loop& loop = *worker.run.loop;
-    const auto row = [k](const Numbers& x, Eigen::Index size) {
-      return Eigen::Map<Vector>(x.data() + k * size, size);
-    };
+    Core& core = *worker.loop.core;
+    StepLoop& step_loop = *worker.loop.step_loop;
+    const auto row = [k](const Numbers& x, Eigen::Index size) { return Eigen::Map<Vector>(x.data() + k * size, size); };
     task.why.data()[k] = not_started;
-    for (const Varied& varied : task.varied) core.vary(varied.part, row(varied.numbers, core.size_of(varied.part)));
-    core.split(worker.q, worker.z);
-    Closing& closing = *worker.closing;  // nothing moves: w and the start's velocity are zero
-    if (!closing.close(task.base, worker.w, tolerance_) || !closing.move(row(task.q, core.d), tolerance_)) return;
-    core.reduce();
-    core.velocity(row(task.q_dot, core.d), worker.v_tree);
+    for (const ParameterColumns& parameter_columns : task.parameter_columns)
+      core.set_parameters(parameter_columns.part,
+                          row(parameter_columns.numbers, core.parameter_size(parameter_columns.part)));
+    core.set_partition(worker.q, worker.z);
+    ClosureSolver& closure_solver = *worker.closure_solver;  // static projection: w and the initial velocity are zero
+    if (!closure_solver.project(task.base, worker.w, tolerance_) ||
+        !closure_solver.continue_to(row(task.q, core.d), tolerance_))
+      return;
+    core.compute_rho();
+    core.multiply_rho(row(task.q_dot, core.d), worker.v_tree);
     if (!worker.v_tree.allFinite()) return;
     const Vector start = core.q_tree;
     const auto T = task.instants.size();
-    worker.rows.resize(loop.recorder.width, T + 1);
-    loop.start(0.0, start, worker.v_tree, worker.w);
-    loop.record(task.instants, worker.rows.data(), T + 1);
+    worker.rows.resize(step_loop.recorder.width, T + 1);
+    step_loop.start(0.0, start, worker.v_tree, worker.w);
+    step_loop.record(task.instants, worker.rows.data(), T + 1);
     Stop stop;
     do {
-      stop = loop.advance(task.until, true, pause, std::numeric_limits<double>::infinity());
-    } while (stop.why == Stop::pause && !cancelled);
-    loop.control->problem = {};
-    task.why.data()[k] = stop.why;
-    const Eigen::Index filled = loop.recorder.filled;
+      stop = step_loop.advance(task.until, true, pause, std::numeric_limits<double>::infinity());
+    } while (stop.reason == Stop::pause && !cancelled);
+    step_loop.control->failure = {};
+    task.why.data()[k] = stop.reason;
+    const Eigen::Index filled = step_loop.recorder.filled;
     task.filled.data()[k] = filled;
-    task.t.data()[k] = loop.t();
-    const long done[] = {loop.work.rhs, loop.steps[0] + loop.steps[1] + loop.steps[2], loop.work.rejected};
+    task.t.data()[k] = step_loop.t();
+    const long done[] = {step_loop.work.rhs, step_loop.steps[0] + step_loop.steps[1] + step_loop.steps[2],
+                         step_loop.work.rejected};
     std::copy(done, done + 3, task.work.data() + 3 * k);
     if (!filled) return;
-    row(task.last, loop.recorder.width) = worker.rows.col(filled - 1);
+    row(task.last, step_loop.recorder.width) = worker.rows.col(filled - 1);
     const auto columns = static_cast<Eigen::Index>(task.columns.size());
     for (Eigen::Index j = 0; j < columns; ++j)
       for (Eigen::Index i = 0; i < std::min(filled, T); ++i)
-        if (worker.rows(0, i) == task.instants(i)) task.kept.data()[(k * columns + j) * T + i] = worker.rows(task.columns[j], i);
-    for (const Crossed& crossed : loop.events.met) {
+        if (worker.rows(0, i) == task.instants(i))
+          task.kept.data()[(k * columns + j) * T + i] = worker.rows(task.columns[j], i);
+    for (const EventOccurrence& crossed : step_loop.events.occurrences) {
       double& first = task.met.data()[k * static_cast<Eigen::Index>(events_) + crossed.event];
       if (!(first <= crossed.t)) first = crossed.t;
     }
@@ -201,7 +222,7 @@ class Batch {
 
 void bind_batch(nb::module_& m) {
   nb::list names;
-  for (int k = 0; k < static_cast<int>(Stop::raised) + 1; ++k) names.append(reasons[k]);
+  for (int k = 0; k < static_cast<int>(Stop::exception) + 1; ++k) names.append(stop_reasons[k]);
   m.attr("reasons") = nb::tuple(names);
   nb::class_<Batch>(m, "Batch")
       .def(nb::init<const nb::dict&, const nb::dict&, const nb::dict&, const nb::dict&, const nb::list&, double, int>(),

@@ -1,4 +1,4 @@
-// What the bindings refuse: wrong sizes and numbers that are none. Nothing below them checks again.
+// Argument checks of the bindings: sizes and finite numbers. The code below them does not check again.
 #pragma once
 
 #include <nanobind/eigen/dense.h>
@@ -19,13 +19,13 @@ namespace nb = nanobind;
 using Given = nb::DRef<const Vector>;
 using Table = nb::DRef<const Matrix>;
 
-inline void require(bool holds, const std::string& says) {
-  if (!holds) throw std::invalid_argument(says);
+inline void require(bool holds, const std::string& message) {
+  if (!holds) throw std::invalid_argument(message);
 }
 
 inline void require(In x, Eigen::Index size, const char* what) {
-  require(x.size() == size, std::string(what) + ": " + std::to_string(size) + " numbers are needed, got " +
-                                std::to_string(x.size()));
+  require(x.size() == size,
+          std::string(what) + ": " + std::to_string(size) + " numbers are needed, got " + std::to_string(x.size()));
   require(x.allFinite(), std::string(what) + ": a number is not finite");
 }
 
@@ -36,8 +36,8 @@ inline void require_square(const Matrix& m, Eigen::Index size, const char* what)
 
 inline void require_indices(const Indices& at, int end, const char* what) {
   for (int k : at)
-    require(k >= 0 && k < end, std::string(what) + ": " + std::to_string(k) + " is none of 0 to " +
-                                   std::to_string(end - 1));
+    require(k >= 0 && k < end,
+            std::string(what) + ": " + std::to_string(k) + " is none of 0 to " + std::to_string(end - 1));
 }
 
 template <class T>
@@ -46,51 +46,52 @@ T get(const nb::dict& table, const char* key) {
   return nb::cast<T>(table[key]);
 }
 
-// A model as Pinocchio serializes it.
-inline std::string model_of(const nb::dict& table) {
+// Return the model in Pinocchio's binary format.
+inline std::string model_from_table(const nb::dict& table) {
   const auto model = get<nb::bytes>(table, "model");
   return {model.c_str(), model.size()};
 }
 
-// Read doubles from an array, ten times sooner than an array's way through DLPack; false where it is none of that size.
+// Read doubles from an array through the buffer protocol, which is ten times as fast as DLPack. False if the size
+// differs.
 inline bool read(nb::handle from, Out to) {
-  Py_buffer found;
-  if (PyObject_GetBuffer(from.ptr(), &found, PyBUF_STRIDES) != 0) return PyErr_Clear(), false;
-  const bool fits = found.ndim == 1 && found.shape[0] == to.size() && found.itemsize == sizeof(double);
-  const auto* data = static_cast<const char*>(found.buf);
+  Py_buffer buffer;
+  if (PyObject_GetBuffer(from.ptr(), &buffer, PyBUF_STRIDES) != 0) return PyErr_Clear(), false;
+  const bool fits = buffer.ndim == 1 && buffer.shape[0] == to.size() && buffer.itemsize == sizeof(double);
+  const auto* data = static_cast<const char*>(buffer.buf);
   for (Eigen::Index i = 0; fits && i < to.size(); ++i)
-    to(i) = *reinterpret_cast<const double*>(data + i * found.strides[0]);
-  PyBuffer_Release(&found);
+    to(i) = *reinterpret_cast<const double*>(data + i * buffer.strides[0]);
+  PyBuffer_Release(&buffer);
   return fits;
 }
 
-// One new array of vectors one after the other; `data` points into it.
+// Create a NumPy array; `data` points to its numbers.
 inline nb::object array(size_t size, double*& data) {
   data = new double[size];
   nb::capsule owner(data, [](void* owned) noexcept { delete[] static_cast<double*>(owned); });
   return nb::cast(nb::ndarray<nb::numpy, double, nb::ndim<1>>(data, {size}, owner));
 }
 
-// Lists of q and z, made again only when the partition has changed.
-struct Places {
+// Python lists of q and z, rebuilt only if the partition changes.
+struct PartitionLists {
   Indices at;
   nb::object q, z;
-  void are(const Core& core) {
+  void update(const Core& core) {
     if (core.q != at) at = core.q, q = nb::cast(core.q), z = nb::cast(core.z);
   }
 };
 
-// A mechanism from Python's tables; one of its terms by name.
-std::unique_ptr<Core> core_of(const nb::dict& table);
-std::unique_ptr<Written> written_of(const nb::tuple& library);  // (path, parameters)
-Closure closure_of(const nb::dict& table);
-SpringTable springs_of(const nb::dict& table);
-nb::object term_of(Core& core, const std::string& name);
+// Build C++ objects from Python's tables, and look up a term by name.
+std::unique_ptr<Core> core_from_table(const nb::dict& table);
+std::unique_ptr<CompiledTerms> compiled_terms_from(const nb::tuple& library);  // (path, parameters)
+Closure closure_from_table(const nb::dict& table);
+SpringTable springs_from_table(const nb::dict& table);
+nb::object term_by_name(Core& core, const std::string& name);
 
 void bind_core(nb::module_& m);
 void bind_loop(nb::module_& m);
 void bind_gate(nb::module_& m);
 void bind_batch(nb::module_& m);
-void bind_plant(nb::module_& m);
+void bind_linearization(nb::module_& m);
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// What acts on a mechanism, from Python's tables; and a caller's own functions, which get the terms that the loop has.
+// Builds controllers and actuators from Python's tables, and calls the user's functions.
 #include <algorithm>
 #include <limits>
 
@@ -10,7 +10,7 @@ namespace ckc {
 
 namespace {
 
-std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
+std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int size) {
   const auto kind = get<std::string>(table, "kind");
   if (kind == "harmonics") {
     const auto amplitude = get<Matrix>(table, "amplitude"), frequency = get<Matrix>(table, "frequency"),
@@ -18,85 +18,94 @@ std::unique_ptr<Motion> motion_of(const nb::dict& table, int size) {
     const auto offset = get<Vector>(table, "offset");
     require(offset, size, "offset");
     for (const Matrix* m : {&amplitude, &frequency, &phase})
-      require(m->rows() == size && m->cols() == amplitude.cols() && m->allFinite(), "harmonics: finite rows are needed");
-    return std::make_unique<Harmonics>(offset, amplitude, frequency, phase);
+      require(m->rows() == size && m->cols() == amplitude.cols() && m->allFinite(),
+              "harmonics: finite rows are needed");
+    return std::make_unique<HarmonicTrajectory>(offset, amplitude, frequency, phase);
   }
   if (kind == "spline") {
     const auto breaks = get<Vector>(table, "breaks");
     const auto coefficients = get<std::vector<Matrix>>(table, "coefficients");
     require(breaks.size() > 1, "spline: at least two breaks are needed"), require(breaks, breaks.size(), "breaks");
     for (const Matrix& c : coefficients)
-      require(c.rows() == breaks.size() - 1 && c.cols() == size && c.allFinite(), "spline: a row of coefficients a piece");
-    return std::make_unique<Spline>(breaks, coefficients);
+      require(c.rows() == breaks.size() - 1 && c.cols() == size && c.allFinite(),
+              "spline: a row of coefficients a piece");
+    return std::make_unique<SplineTrajectory>(breaks, coefficients);
   }
   require(kind == "point", "desired: harmonics, spline or point");
-  PointMotion::Task task{closure_of(get<nb::dict>(table, "closure")), get<Indices>(table, "psi"),
-                         get<Indices>(table, "axis"), get<Vector>(table, "level")};
+  PointTrajectory::Task task{
+      model_from_table(table),    get<Indices>(table, "place"), closure_from_table(get<nb::dict>(table, "closure")),
+      get<Indices>(table, "psi"), get<Indices>(table, "axis"),  get<Vector>(table, "level")};
   const auto n = task.psi.size();
   require(task.axis.size() == n && task.level.size() == static_cast<Eigen::Index>(n), "point: rows of one length");
   require_indices(task.psi, task.closure.rows, "psi");
-  const auto knots = get<Matrix>(table, "knots");
-  const auto times = get<Vector>(table, "times");
-  require(knots.cols() == times.size() && times.size() > 1 && knots.allFinite(), "knots: a column a time is needed");
-  return std::make_unique<PointMotion>(model_of(table), get<Indices>(table, "place"), std::move(task),
-                                       motion_of(get<nb::dict>(table, "path"), 3), get<Indices>(table, "q"), times,
-                                       knots, get<double>(table, "tolerance"), get<double>(table, "end"),
-                                       get<std::string>(table, "past_end"));
+  PointTrajectory::Knots knots{get<Vector>(table, "times"), get<Matrix>(table, "knots"), get<double>(table, "end"),
+                               get<std::string>(table, "past_end")};
+  require(
+      knots.times.size() > 1 && knots.configurations.cols() == knots.times.size() && knots.configurations.allFinite(),
+      "knots: a finite column per time is needed, and at least two");
+  return std::make_unique<PointTrajectory>(std::move(task), trajectory_from_table(get<nb::dict>(table, "path"), 3),
+                                           get<Indices>(table, "q"), std::move(knots), get<double>(table, "tolerance"));
 }
 
-// A caller's own, which gives u as an array of d doubles, or torques, or a string that says why there is none.
-class Caller : public Controller {
+// A user's controller. The function returns an array with u or torques, or a string that says why there is none.
+class CallbackController : public Controller {
  public:
-  // `differs`: how u changes with the state is found by differences; else that is not known.
-  Caller(nb::object function, bool of_motors, bool differs, std::shared_ptr<View> view)
-      : function_(std::move(function)), of_motors_(of_motors), differs_(differs), view_(std::move(view)) {}
-  ~Caller() override {
+  // `differentiates`: compute derivatives by differences; otherwise they are unknown.
+  CallbackController(nb::object function, bool outputs_torques, bool differentiates, std::shared_ptr<View> view)
+      : function_(std::move(function)),
+        outputs_torques_(outputs_torques),
+        differentiates_(differentiates),
+        view_(std::move(view)) {}
+  ~CallbackController() override {
     nb::gil_scoped_acquire acquired;
     function_.reset();
   }
 
-  bool u(const Measured& at, Out u, Problem& problem) override {
+  bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override {
     nb::gil_scoped_acquire acquired;
-    nb::object answer;
+    nb::object result;
     t_ = at.t, v_ = at.v_tree;
-    if (!view_->call(function_, at, problem, answer)) return false;
-    if (read(answer, u)) return true;
-    problem.says = nb::cast<std::string>(answer);
+    if (!view_->call(function_, at, failure, result)) return false;
+    if (read(result, u)) return true;
+    failure.message = nb::cast<std::string>(result);
     return false;
   }
-  bool of_motors() const override { return of_motors_; }
+  bool outputs_torques() const override { return outputs_torques_; }
 
-  // By central differences along each coordinate and each rate of the tree, whether the loops allow it or not.
-  bool slopes(Core& core, const Indices& own, Matrix& by_q, Matrix& by_v) override {
-    if (!differs_) return false;
-    const Vector here = core.q_tree, v = v_;
-    const auto d = static_cast<Eigen::Index>(own.size());
-    Vector step = Vector::Zero(core.n), there, rates, q(d), q_dot(d), u_there(d);
-    Problem problem;
-    bool known = true;
-    const auto add = [&](int k, bool of_rate, double by, Matrix& slope) {
-      there = here, rates = v;
+  // Central differences along each coordinate and rate of the tree, whether or not the loops allow them.
+  bool derivatives(Core& core, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override {
+    if (!differentiates_) return false;
+    const Vector q_tree = core.q_tree, v = v_;
+    const auto d = static_cast<Eigen::Index>(fixed_q.size());
+    Vector step = Vector::Zero(core.n), moved_q, moved_v, q(d), q_dot(d), moved_u(d);
+    ControlFailure failure;
+    bool exists = true;
+    const auto add = [&](int k, bool of_rate, double by, Matrix& derivative) {
+      moved_q = q_tree, moved_v = v;
       step(k) = by;
-      if (of_rate) rates += step;
-      else core.tree.integrate(there, step);
+      if (of_rate)
+        moved_v += step;
+      else
+        core.tree.integrate(moved_q, step);
       step(k) = 0.0;
-      core.set(there);
-      for (Eigen::Index i = 0; i < d; ++i) q(i) = there(core.tree.place[own[i]]), q_dot(i) = rates(own[i]);
-      known = known && u({t_, core, q, q_dot, rates, q_dot}, u_there, problem);
-      slope.col(k) += u_there / (2.0 * by);
+      core.set_configuration(moved_q);
+      for (Eigen::Index i = 0; i < d; ++i)
+        q(i) = moved_q(core.tree.q_index[fixed_q[i]]), q_dot(i) = moved_v(fixed_q[i]);
+      exists = exists && compute_u({t_, core, q, q_dot, moved_v, q_dot}, moved_u, failure);
+      derivative.col(k) += moved_u / (2.0 * by);
     };
     for (int k = 0; k < core.n; ++k)
       for (const double by : {difference, -difference}) add(k, false, by, by_q), add(k, true, by, by_v);
-    if (problem.raised) view_->raised = nullptr;
-    core.set(here), core.set_velocity(v);
+    if (failure.raised) view_->raised = nullptr;
+    core.set_configuration(q_tree), core.set_velocity(v);
     v_ = v;
-    return known && by_q.allFinite() && by_v.allFinite();
+    return exists && by_q.allFinite() && by_v.allFinite();
   }
 
  private:
-  static constexpr double difference = 6e-6;  // rad, m, rad/s, m/s: the third root of rounding
+  static constexpr double difference = 6e-6;  // rad, m, rad/s, m/s: cube root of the machine epsilon
   nb::object function_;
-  const bool of_motors_, differs_;
+  const bool outputs_torques_, differentiates_;
   double t_ = 0.0;  // of the last u
   Vector v_;
   std::shared_ptr<View> view_;
@@ -104,74 +113,76 @@ class Caller : public Controller {
 
 }  // namespace
 
-std::unique_ptr<Controller> law_of(const nb::dict& table, const Core& core, Eigen::Index motors,
-                                   const std::shared_ptr<View>& view) {
+std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                                  const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
-  if (kind == "call") return std::make_unique<Caller>(nb::object(table["function"]), get<bool>(table, "of_motors"), get<bool>(table, "differs"), view);
+  if (kind == "call")
+    return std::make_unique<CallbackController>(nb::object(table["function"]), get<bool>(table, "of_motors"),
+                                                get<bool>(table, "differs"), view);
   if (kind == "torques") {
     const auto times = get<Vector>(table, "times");
     const auto tau = get<Matrix>(table, "tau");
     require(times.size() > 0 && times.allFinite(), "torques: a time is needed");
     require(tau.cols() == times.size() && tau.rows() == motors && tau.allFinite(), "torques: a finite column a time");
-    return std::make_unique<Torques>(times, tau, get<bool>(table, "lines"));
+    return std::make_unique<TorqueTable>(times, tau, get<bool>(table, "lines"));
   }
   const int d = core.d;
   if (kind == "set_point") {
     const auto K_P = get<Matrix>(table, "K_P"), K_V = get<Matrix>(table, "K_V");
     const auto q_d = get<Vector>(table, "q_d"), h_d = get<Vector>(table, "h_d");
     require_square(K_P, d, "K_P"), require_square(K_V, d, "K_V"), require(q_d, d, "q_d"), require(h_d, d, "h_d");
-    return std::make_unique<SetPoint>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
+    return std::make_unique<SetPointController>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
   }
   require(kind == "tracking", "controller: set_point, tracking, torques or call");
   const auto Lambda = get<Matrix>(table, "Lambda"), K_D = get<Matrix>(table, "K_D");
   require_square(Lambda, d, "Lambda"), require_square(K_D, d, "K_D");
   std::unique_ptr<Core> model;
-  if (table.contains("model")) model = core_of(get<nb::dict>(table, "model"));
+  if (table.contains("model")) model = core_from_table(get<nb::dict>(table, "model"));
   require(!model || (model->n == core.n && model->q == core.q), "model: another partition than the plant's");
-  return std::make_unique<Tracking>(Lambda, K_D, motion_of(get<nb::dict>(table, "desired"), d), std::move(model),
-                                    get<bool>(table, "actual"));
+  return std::make_unique<TrackingController>(Lambda, K_D, trajectory_from_table(get<nb::dict>(table, "desired"), d),
+                                              std::move(model), get<bool>(table, "actual"));
 }
 
-// Its arguments: (view, stamp, t, the numbers of `put`, q, z). Arrays are made once, and filled for each call.
-bool View::call(const nb::object& function, const Measured& at, Problem& problem, nb::object& answer) {
+// The function's arguments are (view, stamp, t, numbers of `write_state`, q, z). The arrays are reused by all calls.
+bool View::call(const nb::object& function, const MeasuredState& at, ControlFailure& failure, nb::object& result) {
   nb::gil_scoped_acquire acquired;
   ++calls;
-  seen_ = &at;
+  state_ = &at;
   ++stamp_;
-  put(at);
+  write_state(at);
   bool returned = true;
   try {
-    answer = function(nb::cast(shared_from_this()), stamp_, at.t, numbers_, places_.q, places_.z);
+    result = function(nb::cast(shared_from_this()), stamp_, at.t, numbers_, partition_lists_.q, partition_lists_.z);
   } catch (...) {
     raised = std::current_exception();
-    problem.raised = true;
+    failure.raised = true;
     returned = false;
   }
-  seen_ = nullptr;
+  state_ = nullptr;
   return returned;
 }
 
-// q', v', q, q_dot, one after the other.
-void View::put(const Measured& at) {
+// q', v', q, q_dot, concatenated.
+void View::write_state(const MeasuredState& at) {
   const Core& core = at.core;
   const size_t size = core.q_tree.size() + core.n + 2 * core.d;
   if (!data_) numbers_ = array(size, data_);
-  places_.are(core);
+  partition_lists_.update(core);
   double* place = data_;
   for (const Vector* x : {&core.q_tree, &at.v_tree, &at.q, &at.q_dot})
     place = std::copy(x->data(), x->data() + x->size(), place);
 }
 
 nb::object View::term(long stamp, const std::string& name) {
-  asked = true;
-  if (!seen_ || stamp != stamp_) return nb::none();
-  seen_->core.set_velocity(seen_->v_tree);
-  return term_of(seen_->core, name);
+  term_requested = true;
+  if (!state_ || stamp != stamp_) return nb::none();
+  state_->core.set_velocity(state_->v_tree);
+  return term_by_name(state_->core, name);
 }
 
 namespace {
 
-Actuation actuation_of(const nb::dict& table, const Core& core) {
+Actuation actuation_from_table(const nb::dict& table, const Core& core) {
   const auto turns = get<Matrix>(table, "turns");
   const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
              preload = get<Vector>(table, "preload");
@@ -188,34 +199,35 @@ Actuation actuation_of(const nb::dict& table, const Core& core) {
           Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
 }
 
-Sensor sensor_of(const nb::dict& table, const Core& core) {
+Sensor sensor_from_table(const nb::dict& table, const Core& core) {
   Sensor sensor;
   sensor.resolution = get<Vector>(table, "resolution");
   sensor.q_noise = get<Vector>(table, "q_noise"), sensor.q_dot_noise = get<Vector>(table, "q_dot_noise");
   require(sensor.resolution, core.d, "resolution");
   require(sensor.q_noise, core.d, "q_noise"), require(sensor.q_dot_noise, core.d, "q_dot_noise");
-  sensor.differences = get<bool>(table, "differences"), sensor.smoothing = get<double>(table, "smoothing");
+  sensor.differentiates = get<bool>(table, "differences"), sensor.smoothing = get<double>(table, "smoothing");
   sensor.seed = get<std::uint64_t>(table, "seed");
-  if (table.contains("observer")) sensor.observer = core_of(get<nb::dict>(table, "observer"));
+  if (table.contains("observer")) sensor.observer = core_from_table(get<nb::dict>(table, "observer"));
   return sensor;
 }
 
 }  // namespace
 
-std::unique_ptr<Control> control_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view) {
-  auto control = std::make_unique<Control>(core, actuation_of(table, core));
+std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& core,
+                                            const std::shared_ptr<View>& view) {
+  auto control = std::make_unique<Control>(core, actuation_from_table(table, core));
   const auto motors = control->tau.size();
-  if (table.contains("law")) control->law = law_of(get<nb::dict>(table, "law"), core, motors, view);
+  if (table.contains("law")) control->law = controller_from_table(get<nb::dict>(table, "law"), core, motors, view);
   if (table.contains("clock")) {
     const auto clock = get<nb::dict>(table, "clock");
     Sampling& sampling = control->sampling.emplace();
     sampling.period = get<double>(clock, "period"), sampling.delay = get<double>(clock, "delay");
-    sampling.times = get<Vector>(clock, "times"), sampling.holds = get<bool>(clock, "holds");
+    sampling.times = get<Vector>(clock, "times"), sampling.holds_output = get<bool>(clock, "holds");
   }
-  if (table.contains("sensor")) control->sensor = sensor_of(get<nb::dict>(table, "sensor"), core);
+  if (table.contains("sensor")) control->sensor = sensor_from_table(get<nb::dict>(table, "sensor"), core);
   if (table.contains("drive")) {
     const auto drive = get<nb::dict>(table, "drive");
-    control->drive = Drive{get<Vector>(drive, "resolution"), get<Vector>(drive, "rate"), Vector::Zero(motors)};
+    control->drive = TorqueDrive{get<Vector>(drive, "resolution"), get<Vector>(drive, "rate"), Vector::Zero(motors)};
     require(control->drive->resolution, motors, "resolution");
     require(control->drive->rate.size() == motors, "rate: a number a motor is needed");
   }

@@ -1,4 +1,4 @@
-// Callers' functions, and what acts, as the loop's bindings take them.
+// The user's callbacks, and the control of a loop, as seen by the bindings.
 #pragma once
 
 #include <exception>
@@ -9,31 +9,31 @@
 
 namespace ckc {
 
-// What a caller's function sees: the state that the loop is at, for as long as the call lasts.
+// What a callback sees: the state of the loop, valid during the call.
 class View : public std::enable_shared_from_this<View> {
  public:
-  // Call a function with this; false where it raised, which is kept.
-  bool call(const nb::object& function, const Measured& at, Problem& problem, nb::object& answer);
+  // Call a function with this view. False if it raised an exception, which is stored.
+  bool call(const nb::object& function, const MeasuredState& at, ControlFailure& failure, nb::object& answer);
 
-  // A term by name, none when the call is over.
+  // Return a term by name; None after the call has ended.
   nb::object term(long stamp, const std::string& name);
 
   long calls = 0;
-  bool asked = false;  // for a term, beside the state's numbers
+  bool term_requested = false;  // whether a callback has asked for a term
   std::exception_ptr raised;
 
  private:
-  void put(const Measured& at);
+  void write_state(const MeasuredState& at);
 
-  const Measured* seen_ = nullptr;
+  const MeasuredState* state_ = nullptr;
   long stamp_ = 0;
   double* data_ = nullptr;  // of numbers_
   nb::object numbers_;
-  Places places_;
+  PartitionLists partition_lists_;
 };
 
-std::unique_ptr<Controller> law_of(const nb::dict& table, const Core& core, Eigen::Index motors,
-                                   const std::shared_ptr<View>& view);
-std::unique_ptr<Control> control_of(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view);
+std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                                  const std::shared_ptr<View>& view);
+std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view);
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// A mechanism from Python's tables, and its terms.
+// Bindings of a mechanism's terms.
 #include <limits>
 
 #include <nanobind/stl/unique_ptr.h>
@@ -22,7 +22,8 @@ void require_partition(const Core& core, const Indices& q, const Indices& z) {
       met[k] = true;
     }
   require(static_cast<int>(q.size() + z.size()) == core.n, "partition: a coordinate is missing");
-  require(static_cast<int>(z.size()) <= core.rows.closure.rows, "partition: more dependent coordinates than rows");
+  require(static_cast<int>(z.size()) <= core.constraints.closure.rows,
+          "partition: more dependent coordinates than rows");
 }
 
 std::vector<Vector3> triples(const Matrix& table, const char* what) {
@@ -40,14 +41,15 @@ Matrix3 matrix3(const Matrix& rows, Eigen::Index k) {
 
 }  // namespace
 
-Closure closure_of(const nb::dict& table) {
+Closure closure_from_table(const nb::dict& table) {
   Closure c;
   c.rows = get<int>(table, "rows");
   c.point_joint = get<Indices>(table, "point_joint");
   c.point_local = triples(get<Matrix>(table, "point_local"), "point_local");
   c.direction_joint = get<Indices>(table, "direction_joint");
   c.direction_local = triples(get<Matrix>(table, "direction_local"), "direction_local");
-  for (const auto& row : get<std::vector<Indices>>(table, "component")) c.components.push_back({row[0], row[1], row[2]});
+  for (const auto& row : get<std::vector<Indices>>(table, "component"))
+    c.components.push_back({row[0], row[1], row[2]});
   for (const auto& row : get<std::vector<Indices>>(table, "dot")) c.dots.push_back({row[0], row[1], row[2]});
   const auto lengths = get<Vector>(table, "length");
   for (const auto& row : get<std::vector<Indices>>(table, "distance"))
@@ -66,7 +68,7 @@ Closure closure_of(const nb::dict& table) {
   return c;
 }
 
-SpringTable springs_of(const nb::dict& table) {
+SpringTable springs_from_table(const nb::dict& table) {
   SpringTable s;
   s.point_joint = get<Indices>(table, "point_joint");
   s.point_local = triples(get<Matrix>(table, "point_local"), "point_local");
@@ -82,7 +84,7 @@ SpringTable springs_of(const nb::dict& table) {
 
 namespace {
 
-JointTable joints_of(const nb::dict& table) {
+JointTable joints_from_table(const nb::dict& table) {
   return {get<Vector>(table, "friction"),    get<Vector>(table, "lower"), get<Vector>(table, "upper"),
           get<Vector>(table, "restitution"), get<Vector>(table, "reach"), get<double>(table, "size"),
           get<double>(table, "smoothing")};
@@ -90,50 +92,54 @@ JointTable joints_of(const nb::dict& table) {
 
 }  // namespace
 
-std::unique_ptr<Written> written_of(const nb::tuple& library) {
-  return std::make_unique<Written>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
+std::unique_ptr<CompiledTerms> compiled_terms_from(const nb::tuple& library) {
+  return std::make_unique<CompiledTerms>(nb::cast<std::string>(library[0]), nb::cast<Vector>(library[1]));
 }
 
-std::unique_ptr<Core> core_of(const nb::dict& table) {
-  Scales scales{get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")};
-  std::unique_ptr<Written> written;
-  if (table.contains("written")) written = written_of(nb::cast<nb::tuple>(table["written"]));
-  auto core = std::make_unique<Core>(model_of(table), get<Indices>(table, "place"),
-                                     closure_of(nb::cast<nb::dict>(table["closure"])),
-                                     springs_of(nb::cast<nb::dict>(table["springs"])),
-                                     joints_of(nb::cast<nb::dict>(table["joints"])), get<int>(table, "rank"), scales,
-                                     std::move(written));
-  require(core->scales.rows, core->rows.closure.rows, "row_scale"), require(core->scales.columns, core->n, "column_scale");
+std::unique_ptr<Core> core_from_table(const nb::dict& table) {
+  auto core = std::make_unique<Core>(CoreTable{
+      model_from_table(table),
+      get<Indices>(table, "place"),
+      closure_from_table(get<nb::dict>(table, "closure")),
+      springs_from_table(get<nb::dict>(table, "springs")),
+      joints_from_table(get<nb::dict>(table, "joints")),
+      get<int>(table, "rank"),
+      {get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")},
+      table.contains("written") ? compiled_terms_from(get<nb::tuple>(table, "written")) : nullptr,
+  });
+  require(core->scales.rows, core->constraints.closure.rows, "row_scale");
+  require(core->scales.columns, core->n, "column_scale");
   const auto q = get<Indices>(table, "q"), z = get<Indices>(table, "z");
   require_partition(*core, q, z);
-  core->split(q, z);
+  core->set_partition(q, z);
   return core;
 }
 
 namespace {
 
-// Everything at one state, for comparison.
+// Return all terms at one state, for comparisons.
 nb::dict terms(Core& core, Given q_tree, Given v_tree) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-  core.set(q_tree), core.inertia(), core.set_velocity(v_tree), core.bias(), core.coriolis();
+  core.set_configuration(q_tree), core.compute_D(), core.set_velocity(v_tree), core.compute_bias(),
+      core.compute_coriolis();
   nb::dict found;
   for (const char* name : {"phi", "J", "rho", "D_tree", "D", "bias_tree", "C_tree", "h_tree", "C", "rho_dot", "h"})
-    found[name] = term_of(core, name);
-  found["J_dot_v"] = core.J_dot_v, found["J_dot"] = core.rows.J_dot;
+    found[name] = term_by_name(core, name);
+  found["J_dot_v"] = core.J_dot_v, found["J_dot"] = core.constraints.J_dot;
   return found;
 }
 
 Matrix jacobian(Core& core, Given q_tree) {
   require(q_tree, core.tree.nq, "q_tree");
-  core.set(q_tree), core.jacobian();
-  return core.rows.J;
+  core.set_configuration(q_tree), core.compute_J();
+  return core.constraints.J;
 }
 
 Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree, Given u_tree, bool actual) {
   require(q_tree, core.tree.nq, "q_tree"), require(q_dot, core.d, "q_dot");
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
   Vector q_ddot(core.d);
-  core.set(q_tree), core.set_velocity(v_tree);
+  core.set_configuration(q_tree), core.set_velocity(v_tree);
   if (actual)
     core.actual_acceleration(u_tree, q_dot, q_ddot);
   else
@@ -143,9 +149,9 @@ Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree,
 
 Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Given correction) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
-  require(u_tree, core.n, "u_tree"), require(correction, core.rows.closure.rows, "correction");
+  require(u_tree, core.n, "u_tree"), require(correction, core.constraints.closure.rows, "correction");
   Vector acceleration(core.n);
-  core.set(q_tree, true), core.set_velocity(v_tree);
+  core.set_configuration(q_tree, true), core.set_velocity(v_tree);
   if (!core.dae_acceleration(u_tree, correction, acceleration))
     acceleration.setConstant(std::numeric_limits<double>::quiet_NaN());
   return acceleration;
@@ -153,36 +159,36 @@ Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Gi
 
 }  // namespace
 
-nb::object term_of(Core& core, const std::string& name) {
+nb::object term_by_name(Core& core, const std::string& name) {
   if (name == "at") return nb::none();
-  if (name == "phi") return nb::cast(core.rows.phi);
-  if (name == "J") return core.jacobian(), nb::cast(core.rows.J);
-  if (name == "rho") return core.reduce(), nb::cast(core.rho);
-  if (name == "D") return core.inertia(), nb::cast(core.D);
-  if (name == "bias_tree") return core.bias(), nb::cast(core.bias_tree);
+  if (name == "phi") return nb::cast(core.constraints.phi);
+  if (name == "J") return core.compute_J(), nb::cast(core.constraints.J);
+  if (name == "rho") return core.compute_rho(), nb::cast(core.rho);
+  if (name == "D") return core.compute_D(), nb::cast(core.D);
+  if (name == "bias_tree") return core.compute_bias(), nb::cast(core.bias_tree);
   if (name == "potential_energy") return nb::cast(core.potential_energy());
   if (name == "D_tree") {
-    core.tree_inertia();
+    core.compute_D_tree();
     Matrix D_tree(core.n, core.n);
-    for (int k = 0; k < core.n; ++k) core.D_times(Vector::Unit(core.n, k), D_tree.col(k));
+    for (int k = 0; k < core.n; ++k) core.multiply_D_tree(Vector::Unit(core.n, k), D_tree.col(k));
     return nb::cast(D_tree);
   }
-  core.reduce(), core.tree_inertia(), core.coriolis();
+  core.compute_rho(), core.compute_D_tree(), core.compute_coriolis();
   if (name == "C_tree") {
     Matrix C_tree(core.n, core.n);
-    for (int k = 0; k < core.n; ++k) core.C_tree_times(Vector::Unit(core.n, k), C_tree.col(k));
+    for (int k = 0; k < core.n; ++k) core.multiply_C_tree(Vector::Unit(core.n, k), C_tree.col(k));
     return nb::cast(C_tree);
   }
   if (name == "h_tree") return nb::cast(core.h_tree);
   Vector x(core.d);
-  if (name == "h") return core.reduced(core.h_tree, x), nb::cast(x);
+  if (name == "h") return core.multiply_rho_transposed(core.h_tree, x), nb::cast(x);
   Matrix of_q(core.d, core.d), of_tree(core.n, core.d);
   for (int k = 0; k < core.d; ++k) {
     x = Vector::Unit(core.d, k);
     if (name == "C")
-      core.C_times(x, of_q.col(k));
+      core.multiply_C(x, of_q.col(k));
     else
-      core.rho_dot_times(x, of_tree.col(k));
+      core.multiply_rho_dot(x, of_tree.col(k));
   }
   if (name == "C") return nb::cast(of_q);
   require(name == "rho_dot", "term: no " + name);
@@ -191,13 +197,14 @@ nb::object term_of(Core& core, const std::string& name) {
 
 void bind_core(nb::module_& m) {
   nb::class_<Core>(m, "Core")
-      .def(nb::new_(&core_of), "table"_a)
-      .def("split",
-           [](Core& core, const Indices& q, const Indices& z) {
-             require_partition(core, q, z);
-             core.split(q, z);
-           },
-           "q"_a, "z"_a)
+      .def(nb::new_(&core_from_table), "table"_a)
+      .def(
+          "split",
+          [](Core& core, const Indices& q, const Indices& z) {
+            require_partition(core, q, z);
+            core.set_partition(q, z);
+          },
+          "q"_a, "z"_a)
       .def("jacobian", &jacobian, "q_tree"_a)
       .def("terms", &terms, "q_tree"_a, "v_tree"_a)
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)

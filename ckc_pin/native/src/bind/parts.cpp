@@ -1,4 +1,4 @@
-// Parts of the core one by one, for the tests.
+// Bindings of single parts of the core, for tests.
 #include <cmath>
 
 #include "bind/run.hpp"
@@ -11,35 +11,37 @@ using namespace nb::literals;
 
 namespace {
 
-// All sign changes of a function over [start, end], as events find them: ([(t, direction)], sign, on zero); `exact`: the
-// function where the other one is a little off.
-nb::tuple walk_over(const nb::callable& function, double start, double end, int sign, double floor, nb::object exact) {
-  const Vector places = walk_places();
-  Vector values(places.size());
-  const auto gap_of = [](const nb::object& f) -> Gap {
+// Find all sign changes of a function over [start, end] as events do; `exact`: the exact function, if `function` is
+// an approximation.
+nb::tuple sign_changes_of(const nb::callable& function, double start, double end, int sign, double floor,
+                          nb::object exact) {
+  const Vector points = sample_points();
+  Vector values(points.size());
+  const auto gap_of = [](const nb::object& f) -> ScalarFunction {
     return [&f](double t, double& value) { return value = nb::cast<double>(f(t)), true; };
   };
-  const Gap gap = gap_of(function), better = gap_of(exact);
-  for (Eigen::Index k = 0; k < places.size(); ++k) gap(start + (end - start) * places(k), values(k));
-  Walk walked;
-  walk(gap, start, end, values, sign, floor, walked, exact.is_none() ? nullptr : &better);
+  const ScalarFunction gap = gap_of(function), better = gap_of(exact);
+  for (Eigen::Index k = 0; k < points.size(); ++k) gap(start + (end - start) * points(k), values(k));
+  RootSearch search;
+  search.find(gap, {start, end}, values, sign, floor, exact.is_none() ? nullptr : &better);
   nb::list found;
-  for (const auto& [t, direction] : walked.found) found.append(nb::make_tuple(t, direction));
-  return nb::make_tuple(found, walked.sign, walked.on_zero);
+  for (const auto& [t, direction] : search.sign_changes) found.append(nb::make_tuple(t, direction));
+  return nb::make_tuple(found, search.sign, search.on_zero);
 }
 
-// A predictor on a mechanism, which starts from a configuration.
-struct Predicting {
+// A predictor of a mechanism that starts from a configuration.
+struct BoundPredictor {
   std::unique_ptr<Core> core;
   Chart chart;
   Predictor predictor;
 
-  Predicting(const nb::dict& table, Given q_tree, double epsilon) : core(core_of(table)), predictor(*core, epsilon) {
-    core->set(q_tree), core->reduce();
-    chart.start(*core, q_tree), predictor.start(*core, q_tree);
+  BoundPredictor(const nb::dict& table, Given q_tree, double epsilon)
+      : core(core_from_table(table)), predictor(*core, epsilon) {
+    core->set_configuration(q_tree), core->compute_rho();
+    chart.reset(*core, q_tree), predictor.reset(*core, q_tree);
   }
   void add(double t, Given q_tree, Given v_tree, Given w) {
-    core->set(q_tree), core->reduce();
+    core->set_configuration(q_tree), core->compute_rho();
     predictor.add(t, *core, q_tree, v_tree, w);
   }
   Vector predict(double t, Given numbers, Given w) {
@@ -55,84 +57,78 @@ nb::tuple weights(const Vector& times, double t) {
   return nb::make_tuple(a, b);
 }
 
-// The matrix by which a rotation vector moves, its derivative along a, and of that along b.
+// Return the Jacobian of a rotation vector, its derivative along a, and the derivative of that along b.
 nb::tuple log_rates(const Vector& u, const Vector& a, const Vector& b) {
   require(u, 3, "u"), require(a, 3, "a"), require(b, 3, "b");
-  const Vector3 along_a = a, along_b = b;
-  const LogRate found{Vector3(u)};
-  return nb::make_tuple(Matrix(found.value), Matrix(found.along(along_a)), Matrix(found.along(along_a, along_b)));
+  const Vector3 direction_a = a, direction_b = b;
+  const LogJacobian log{Vector3(u)};
+  return nb::make_tuple(Matrix(log.value), Matrix(log.derivative(direction_a)),
+                        Matrix(log.second_derivative(direction_a, direction_b)));
 }
 
-Dae& dae_of(Run& run) {
-  Dae* dae = dynamic_cast<Dae*>(run.loop->system.get());
-  require(dae, "a DAE is needed");
-  return *dae;
-}
-
-// What the rank monitor has of J, scaled: its least singular value, and its rate, at a state of a DAE as it is.
-nb::tuple rank(Run& run, Given y) {
-  Dae& dae = dae_of(run);
-  require(y, dae.size, "y");
-  dae.at_last(0.0, y);
-  const RankMonitor::Rank found = RankMonitor(*run.core).at(dae);
+// Return the rank monitor's smallest singular value and its rate at a state of a DAE.
+nb::tuple rank(Loop& loop, Given y) {
+  System& system = *loop.step_loop->system;
+  require(y, system.size, "y");
+  system.sync_core_at_last_rhs(0.0, y);
+  const RankMonitor::Rank found = RankMonitor(*loop.core).evaluate(system);
   return nb::make_tuple(found.value, found.rate);
 }
 
-// Where one collocation step of so many stages from the present state ends.
-Vector collocate(Run& run, double span, int stages) {
-  Dae& dae = dae_of(run);
-  const Step& now = run.loop->now;
-  Collocation step(dae, run.loop->work, stages, stages);
-  Vector y(dae.size);
-  step.make(now.t, now.y, span, false);
-  step.at(now.t + span, y);
+// Return the end of one collocation step from the present state.
+Vector collocate(Loop& loop, double span, int stages) {
+  System& system = *loop.step_loop->system;
+  const Step& now = loop.step_loop->now;
+  Collocation step(system, loop.step_loop->work, stages, stages);
+  Vector y(system.size);
+  step.make_step(now.t, now.y, span, false);
+  step.evaluate(now.t + span, y);
   return y;
 }
 
-nb::object rate_on_closure(Run& run, double t, Given y) {
-  Dae& dae = dae_of(run);
-  require(y, dae.size, "y");
-  Vector y_dot(dae.size);
-  return dae.rate_on_closure(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
+nb::object rate_on_manifold(Loop& loop, double t, Given y) {
+  System& system = *loop.step_loop->system;
+  require(y, system.size, "y");
+  Vector y_dot(system.size);
+  return system.rate_on_manifold(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
 }
 
-// (q', v') put on the closure.
-nb::object on_closure(Run& run, double t, Given y) {
-  Dae& dae = dae_of(run);
-  require(y, dae.size, "y");
-  if (!dae.exact(t, y)) return nb::none();
-  return nb::make_tuple(Vector(run.core->q_tree), Vector(dae.velocity));
+// Project (q', v') onto the constraint manifold.
+nb::object on_closure(Loop& loop, double t, Given y) {
+  System& system = *loop.step_loop->system;
+  require(y, system.size, "y");
+  if (!system.sync_core(t, y)) return nb::none();
+  return nb::make_tuple(Vector(loop.core->q_tree), Vector(system.velocity));
 }
 
-// The modes by which a motion counts as stiff.
-nb::object modes(Run& run, Matrix jacobian) {
-  const Step& now = run.loop->now;
-  return run.loop->system->modes(now.y, jacobian) ? nb::cast(jacobian) : nb::none();
+// Return the reduced Jacobian that decides about stiffness.
+nb::object modes(Loop& loop, Matrix jacobian) {
+  const Step& now = loop.step_loop->now;
+  return loop.step_loop->system->reduce_to_freedoms(now.y, jacobian) ? nb::cast(jacobian) : nb::none();
 }
 
 }  // namespace
 
-void bind_parts(nb::module_& m, nb::class_<Run>& loop) {
-  m.def("walk", &walk_over, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a,
-        "exact"_a.none() = nb::none());
-  m.def("stiff", &stiff, "jacobian"_a, "duration"_a);
+void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
+  m.def("walk", &sign_changes_of, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a, "exact"_a.none() = nb::none());
+  m.def("stiff", &is_stiff, "jacobian"_a, "duration"_a);
   m.def("log_rates", &log_rates, "u"_a, "a"_a, "b"_a);
   m.def("hermite_weights", &weights, "times"_a, "t"_a);
-  nb::class_<Predicting>(m, "Predictor")
+  nb::class_<BoundPredictor>(m, "Predictor")
       .def(nb::init<const nb::dict&, Given, double>(), "core"_a, "q_tree"_a, "epsilon"_a)
-      .def("add", &Predicting::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
-      .def("predict", &Predicting::predict, "t"_a, "numbers"_a, "w"_a);
-  loop.def("rank", &rank, "y"_a)
+      .def("add", &BoundPredictor::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
+      .def("predict", &BoundPredictor::predict, "t"_a, "numbers"_a, "w"_a);
+  binding.def("rank", &rank, "y"_a)
       .def("modes", &modes, "jacobian"_a)
       .def("collocate", &collocate, "span"_a, "stages"_a)
-      .def("rate_on_closure", &rate_on_closure, "t"_a, "y"_a)
+      .def("rate_on_closure", &rate_on_manifold, "t"_a, "y"_a)
       .def("on_closure", &on_closure, "t"_a, "y"_a)
-      .def_prop_rw(  // of the next step; 0 for one that is estimated
-          "length", [](const Run& run) { return run.loop->now.h; },
-          [](Run& run, double length) { run.loop->now.h = length; })
+      .def_prop_rw(  // of the next step; 0 lets the method estimate it
+          "length", [](const Loop& loop) { return loop.step_loop->now.h; },
+          [](Loop& loop, double length) { loop.step_loop->now.h = length; })
       .def_prop_rw(
-          "newton_tolerance", [](const Run& run) { return run.loop->newton_tolerance(); },
-          [](Run& run, double tolerance) { run.loop->newton_tolerance() = tolerance; });
+          "newton_tolerance", [](const Loop& loop) { return loop.step_loop->newton_tolerance(); },
+          [](Loop& loop, double tolerance) { loop.step_loop->newton_tolerance() = tolerance; });
 }
 
 }  // namespace ckc

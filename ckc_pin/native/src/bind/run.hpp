@@ -1,30 +1,31 @@
-// A loop with what its callers' functions need.
+// The loop that Python sees: the step loop with its core and callbacks.
 #pragma once
 
 #include "bind/control.hpp"
 #include "motion/level_set.hpp"
 #include "motion/loop.hpp"
-#include "sensitivity/sensitivities.hpp"
+#include "sensitivity/sensitivity_system.hpp"
 
 namespace ckc {
 
-struct Run {
+struct Loop {
   std::shared_ptr<View> view = std::make_shared<View>();
   std::unique_ptr<Core> core;
-  std::unique_ptr<Loop> loop;
+  std::unique_ptr<StepLoop> step_loop;
+  SensitivityResults* sensitivities = nullptr;  // of the step loop's system; null without sensitivities
   nb::object rows;
-  Places places;
-  long rhs_before = 0;  // right-hand sides before the core was given terms that are written out
+  PartitionLists partition_lists;
+  long rhs_before_compiled = 0;  // right-hand sides before compiled terms were used
 };
 
-// Make its loop, from Python's tables.
-void prepare(Run& run, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
+// Build the loop from Python's tables.
+void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
              const nb::dict& solver, const nb::list& events);
 
-extern const char* const reasons[];  // why a loop stopped, as Python has it
+extern const char* const stop_reasons[];  // why a loop stopped, as Python has it
 
-void bind_parts(nb::module_& m, nb::class_<Run>& loop);
-void bind_variation(nb::class_<Run>& loop);
-VariationTable variation_of(const nb::dict& table);
+void bind_parts(nb::module_& m, nb::class_<Loop>& binding);
+void bind_sensitivities(nb::class_<Loop>& binding);
+SensitivityTable sensitivity_table(const nb::dict& table);
 
 }  // namespace ckc

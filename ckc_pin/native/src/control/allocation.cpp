@@ -6,11 +6,11 @@
 namespace ckc {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr double rounding = 1e-13;  // of u, scaled: what a tau may miss it by
-constexpr double flat = 1e-12;      // of the dual's largest curvature: a direction in which it has none
-constexpr double gives = 1e-7;      // of that curvature: added where u is out of reach
-constexpr double settled = 1e-6;    // how far from 1 the length of Newton's last step is
-constexpr int most = 50;            // steps; random problems take at most 10
+constexpr double u_rounding = 1e-13;           // relative error allowed in u, scaled
+constexpr double curvature_tolerance = 1e-12;  // of the dual's largest curvature: below it a direction counts as flat
+constexpr double penalty = 1e-7;               // relative to that curvature, of missing u where it cannot be reached
+constexpr double full_step_tolerance = 1e-6;   // a Newton step whose length differs from 1 by less is a full step
+constexpr int max_newton_steps = 50;           // random problems need at most 10
 
 Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector preload)
     : limit(std::move(limit_)),
@@ -24,17 +24,17 @@ Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector 
   else
     factor_.shape(motors, motors, full_pattern(motors));
   scaled_.setZero(redundant_ ? motors : d, redundant_ ? d : motors), curvature_.setZero(d, d);
-  for (Vector* x : {&rest_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
-  for (Vector* x : {&unlimited_, &raw_, &slope_, &enters_, &leaves_}) x->setZero(motors);
-  ends_.setZero(2 * motors);
-  if (d) eigen_.compute(Matrix::Identity(d, d));  // what has computed nothing has no state that may be moved
+  for (Vector* x : {&residual_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
+  for (Vector* x : {&unlimited_, &unclamped_, &tau_direction_, &becomes_free_, &becomes_limited_}) x->setZero(motors);
+  breakpoints_.setZero(2 * motors);
+  if (d) eigen_.compute(Matrix::Identity(d, d));  // A solver that has computed nothing cannot be moved, so use it once.
 }
 
-void Allocation::share(const Matrix& transmission, In u, Out tau) {
+void Allocation::allocate(const Matrix& transmission, In u, Out tau) {
   if (redundant_) {
     scaled_ = transmission, scaled_.array().colwise() *= scale_.array();
-    rest_ = u, rest_.noalias() -= transmission.transpose() * preload_;
-    factor_.compute(scaled_), factor_.solve_transposed(rest_, tau);
+    residual_ = u, residual_.noalias() -= transmission.transpose() * preload_;
+    factor_.compute(scaled_), factor_.solve_transposed(residual_, tau);
     tau = preload_ + scale_.cwiseProduct(tau);
   } else {
     scaled_ = transmission.transpose();
@@ -42,14 +42,16 @@ void Allocation::share(const Matrix& transmission, In u, Out tau) {
   }
   if (!(tau.array().abs() > limit.array()).any()) return;
   unlimited_ = tau;
-  if (redundant_ && (within_limits(transmission, u, tau, 0.0) || within_limits(transmission, u, tau, gives))) return;
-  tau = unlimited_, clip(tau);
+  if (redundant_ && (solve_with_limits(transmission, u, tau, 0.0) || solve_with_limits(transmission, u, tau, penalty)))
+    return;
+  tau = unlimited_, clamp(tau);
 }
 
-// With `give`, of the largest curvature, u may be missed, at a price of the miss squared by `give`.
-bool Allocation::within_limits(const Matrix& transmission, In u, Out tau, double give) {
+// With a `penalty_weight` (relative to the largest curvature), u may be missed at a quadratic cost.
+bool Allocation::solve_with_limits(const Matrix& transmission, In u, Out tau, double penalty_weight) {
   const auto m = transmission.rows();
-  for (Eigen::Index i = 0; i < row_scale_.size(); ++i) row_scale_(i) = 1.0 / std::max(transmission.col(i).norm(), 1e-300);
+  for (Eigen::Index i = 0; i < row_scale_.size(); ++i)
+    row_scale_(i) = 1.0 / std::max(transmission.col(i).norm(), 1e-300);
   scaled_ = transmission, scaled_.array().rowwise() *= row_scale_.array().transpose();
   coefficients_ = u.cwiseProduct(row_scale_);
   double size = coefficients_.norm(), steepest = 0.0;
@@ -57,86 +59,90 @@ bool Allocation::within_limits(const Matrix& transmission, In u, Out tau, double
     if (std::isfinite(limit(k))) size += limit(k) * scaled_.row(k).norm();
     steepest += scaled_.row(k).squaredNorm() / weights_(k);
   }
-  multiplier_.setZero(), free_.assign(m, 0), give *= steepest;
-  bool whole = false;
-  for (int step = 0; step < most; ++step) {
-    raw_.noalias() = scaled_ * multiplier_;
-    if (step && give == 0.0 && beyond(u, rounding * size)) return false;
-    raw_ = preload_ + raw_.cwiseQuotient(weights_);
-    tau = raw_, clip(tau);
-    rest_ = u.cwiseProduct(row_scale_) - give * multiplier_, rest_.noalias() -= scaled_.transpose() * tau;
-    const bool solved = rest_.norm() <= rounding * size;
-    bool same = whole;
+  multiplier_.setZero(), free_.assign(m, 0), penalty_weight *= steepest;
+  bool took_full_step = false;
+  for (int step = 0; step < max_newton_steps; ++step) {
+    unclamped_.noalias() = scaled_ * multiplier_;
+    if (step && penalty_weight == 0.0 && is_out_of_reach(u, u_rounding * size)) return false;
+    unclamped_ = preload_ + unclamped_.cwiseQuotient(weights_);
+    tau = unclamped_, clamp(tau);
+    residual_ = u.cwiseProduct(row_scale_) - penalty_weight * multiplier_,
+    residual_.noalias() -= scaled_.transpose() * tau;
+    const bool solved = residual_.norm() <= u_rounding * size;
+    bool active_set_unchanged = took_full_step;
     curvature_.setZero();
     for (Eigen::Index k = 0; k < m; ++k) {
-      const int is_free = std::abs(raw_(k)) < limit(k);
-      same &= free_[k] == is_free, free_[k] = is_free;
+      const int is_free = std::abs(unclamped_(k)) < limit(k);
+      active_set_unchanged &= free_[k] == is_free, free_[k] = is_free;
       if (is_free) curvature_.noalias() += (1.0 / weights_(k)) * scaled_.row(k).transpose() * scaled_.row(k);
     }
-    if (solved || same) return true;
+    if (solved || active_set_unchanged) return true;
     eigen_.compute(curvature_);
-    coefficients_.noalias() = eigen_.eigenvectors().transpose() * rest_;
+    coefficients_.noalias() = eigen_.eigenvectors().transpose() * residual_;
     const Vector& values = eigen_.eigenvalues();
-    double level = 0.0;  // along what has no curvature
+    double flat_norm_squared = 0.0;  // squared norm of the residual along flat directions
     for (Eigen::Index i = 0; i < values.size(); ++i)
-      if (values(i) <= flat * steepest) level += coefficients_(i) * coefficients_(i);
-    const bool straight = std::sqrt(level) > rounding * size;
+      if (values(i) <= curvature_tolerance * steepest) flat_norm_squared += coefficients_(i) * coefficients_(i);
+    const bool follows_flat_direction = std::sqrt(flat_norm_squared) > u_rounding * size;
     for (Eigen::Index i = 0; i < values.size(); ++i) {
-      const bool curved = values(i) > flat * steepest;
-      if (give > 0.0)
-        coefficients_(i) /= values(i) + give;
-      else if (straight)
+      const bool curved = values(i) > curvature_tolerance * steepest;
+      if (penalty_weight > 0.0)
+        coefficients_(i) /= values(i) + penalty_weight;
+      else if (follows_flat_direction)
         coefficients_(i) = curved ? 0.0 : coefficients_(i);
       else
         coefficients_(i) = curved ? coefficients_(i) / values(i) : 0.0;
     }
     direction_.noalias() = eigen_.eigenvectors() * coefficients_;
-    rise_ = direction_.dot(rest_);
-    slope_.noalias() = scaled_ * direction_;
-    slope_ = slope_.cwiseQuotient(weights_);
-    const double length = along(give * direction_.squaredNorm());
+    directional_derivative_ = direction_.dot(residual_);
+    tau_direction_.noalias() = scaled_ * direction_;
+    tau_direction_ = tau_direction_.cwiseQuotient(weights_);
+    const double length = line_search(penalty_weight * direction_.squaredNorm());
     if (!std::isfinite(length)) return false;
     multiplier_ += length * direction_;
-    whole = give > 0.0 && std::abs(length - 1.0) < settled;
+    took_full_step = penalty_weight > 0.0 && std::abs(length - 1.0) < full_step_tolerance;
   }
   return false;
 }
 
-// Whether what the multiplier weighs in u is more than all motors together can do (Farkas).
-bool Allocation::beyond(In u, double least) const {
+// Whether the multiplier proves that u is out of reach of all motors together (Farkas' lemma).
+bool Allocation::is_out_of_reach(In u, double tolerance) const {
   const double length = multiplier_.norm();
-  double most = least * length;
-  for (Eigen::Index k = 0; k < raw_.size(); ++k) {
-    const double pull = std::abs(raw_(k));
+  double bound = tolerance * length;
+  for (Eigen::Index k = 0; k < unclamped_.size(); ++k) {
+    const double pull = std::abs(unclamped_(k));
     if (std::isfinite(limit(k)))
-      most += limit(k) * pull;
-    else if (pull > rounding * length * scaled_.row(k).norm())
+      bound += limit(k) * pull;
+    else if (pull > u_rounding * length * scaled_.row(k).norm())
       return false;
   }
-  return multiplier_.dot(u.cwiseProduct(row_scale_)) > most;
+  return multiplier_.dot(u.cwiseProduct(row_scale_)) > bound;
 }
 
-// Along direction_ the dual's slope falls from rise_ by w slope^2 for every motor while it is within its limits, and `bent`.
-double Allocation::along(double bent) {
-  const auto m = slope_.size();
+// Maximize the dual along direction_. Its derivative starts at directional_derivative_ and decreases by weight
+// tau_direction^2 for each motor within its limits, and by `penalty_curvature`.
+double Allocation::line_search(double penalty_curvature) {
+  const auto m = tau_direction_.size();
   Eigen::Index count = 0;
   for (Eigen::Index k = 0; k < m; ++k) {
-    enters_(k) = 0.0, leaves_(k) = slope_(k) == 0.0 ? 0.0 : infinity;
-    if (slope_(k) == 0.0 || !std::isfinite(limit(k))) continue;
-    const double low = (-limit(k) - raw_(k)) / slope_(k), high = (limit(k) - raw_(k)) / slope_(k);
-    enters_(k) = std::max(0.0, std::min(low, high)), leaves_(k) = std::max(0.0, std::max(low, high));
-    ends_(count++) = enters_(k), ends_(count++) = leaves_(k);
+    becomes_free_(k) = 0.0, becomes_limited_(k) = tau_direction_(k) == 0.0 ? 0.0 : infinity;
+    if (tau_direction_(k) == 0.0 || !std::isfinite(limit(k))) continue;
+    const double low = (-limit(k) - unclamped_(k)) / tau_direction_(k),
+                 high = (limit(k) - unclamped_(k)) / tau_direction_(k);
+    becomes_free_(k) = std::max(0.0, std::min(low, high)), becomes_limited_(k) = std::max(0.0, std::max(low, high));
+    breakpoints_(count++) = becomes_free_(k), breakpoints_(count++) = becomes_limited_(k);
   }
-  std::sort(ends_.data(), ends_.data() + count);
-  double at = 0.0, left = rise_;
+  std::sort(breakpoints_.data(), breakpoints_.data() + count);
+  double at = 0.0, derivative = directional_derivative_;
   for (Eigen::Index i = 0; i <= count; ++i) {
-    const double end = i < count ? ends_(i) : infinity;
+    const double end = i < count ? breakpoints_(i) : infinity;
     if (!(end > at)) continue;
-    double bend = bent;
+    double curvature = penalty_curvature;
     for (Eigen::Index k = 0; k < m; ++k)
-      if (enters_(k) <= at && leaves_(k) > at) bend += weights_(k) * slope_(k) * slope_(k);
-    if (bend > 0.0 && left <= bend * (end - at)) return at + left / bend;
-    if (bend > 0.0) left -= bend * (end - at);
+      if (becomes_free_(k) <= at && becomes_limited_(k) > at)
+        curvature += weights_(k) * tau_direction_(k) * tau_direction_(k);
+    if (curvature > 0.0 && derivative <= curvature * (end - at)) return at + derivative / curvature;
+    if (curvature > 0.0) derivative -= curvature * (end - at);
     at = end;
   }
   return infinity;

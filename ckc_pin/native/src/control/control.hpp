@@ -1,5 +1,5 @@
-// What acts on a mechanism: nothing, a constant u, one of the paper's controllers or a caller's own, sampled or not,
-// through actuators with limits.
+// Control of a mechanism: no control, a constant u, a controller of the paper or of the user, sampled or continuous,
+// acting through motors with limits.
 #pragma once
 
 #include <cmath>
@@ -15,47 +15,50 @@
 
 namespace ckc {
 
-// The state that a controller sees: the core there, with D' and the bias, and q, q_dot of the user's partition.
-struct Measured {
+// The state that a controller sees: the core at that state with its terms, and q and q_dot of the user's partition.
+struct MeasuredState {
   double t;
   Core& core;
   const Vector &q, &q_dot;
-  const Vector& v_tree;  // what C takes its velocity from
+  const Vector& v_tree;  // velocity that C uses
   const Vector& rate;    // q_dot of the core's partition
 };
 
-// Why a controller has no u, or its caller's exception.
-struct Problem {
-  std::string says;
-  Vector u;             // one that is not finite
-  bool raised = false;  // an exception of the caller's, kept by who called it
+// Why a controller has no u.
+struct ControlFailure {
+  std::string message;
+  Vector u;             // a value that is not finite
+  bool raised = false;  // the callback has raised an exception, which the caller stores
 };
 
 class Controller {
  public:
   virtual ~Controller() = default;
-  // Eq. 6's force, or the motors' torques; false where there is none.
-  virtual bool u(const Measured& at, Out u, Problem& problem) = 0;
-  virtual bool of_motors() const { return false; }
-  // Its Lyapunov function; NaN where it has none here. w: what phi is.
-  virtual double lyapunov(const Measured&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
-  // Whether it looks at terms of q's own partition, or at q and q_dot alone.
+  // Compute eq. 6's force u, or motor torques. False if there is none; `failure` says why.
+  virtual bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) = 0;
+  virtual bool outputs_torques() const { return false; }
+  // Value of its Lyapunov function, NaN if there is none. `w`: present value of phi.
+  virtual double lyapunov(const MeasuredState&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
+  // Whether it uses terms in the fixed partition, not only q and q_dot.
   virtual bool needs_terms() const { return true; }
-  // d u / d q' and d u / d v', tangent, of the last u, at the core's state; zero so far; `own`: q. False where unknown.
-  virtual bool slopes(Core&, const Indices&, Matrix&, Matrix&) { return false; }
-  // What u would be more, where `slopes` has found how it changes, if gains were more by this: of positions, of rates.
-  virtual void by_gains(const Measured&, const Matrix&, const Matrix&, Out more) { more.setZero(); }
+  // Derivatives of the last u with respect to q' (tangent) and v', at the core's state. The matrices are zero on
+  // entry; the indices are those of q. False if unknown.
+  virtual bool derivatives(Core&, const Indices&, Matrix&, Matrix&) { return false; }
+  // Derivative of u for a change of the gains (of positions, of rates); requires `derivatives`.
+  virtual void gain_derivative(const MeasuredState&, const Matrix&, const Matrix&, Out derivative) {
+    derivative.setZero();
+  }
 };
 
-// Eq. 14.
-class SetPoint : public Controller {
+// Set-point controller, eq. 14.
+class SetPointController : public Controller {
  public:
-  SetPoint(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d);
-  bool u(const Measured& at, Out u, Problem& problem) override;
-  double lyapunov(const Measured& at, double potential_energy, In w) override;
+  SetPointController(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d);
+  bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override;
+  double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
-  bool slopes(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) override;
-  void by_gains(const Measured& at, const Matrix& K_P, const Matrix& K_V, Out more) override;
+  bool derivatives(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  void gain_derivative(const MeasuredState& at, const Matrix& K_P, const Matrix& K_V, Out derivative) override;
 
  private:
   Matrix K_P_, K_V_;
@@ -64,137 +67,144 @@ class SetPoint : public Controller {
   Vector e_, product_;
 };
 
-// Eq. 16. `model`: the controller's own idea of the plant, at the measured q' and at rho q_dot, or "actual".
-class Tracking : public Controller {
+// Tracking controller, eq. 16. `model`: the controller's own model of the plant, evaluated at the measured q' and at
+// rho q_dot, or at the "actual" velocity.
+class TrackingController : public Controller {
  public:
-  Tracking(Matrix Lambda, Matrix K_D, std::unique_ptr<Motion> desired, std::unique_ptr<Core> model, bool actual);
-  bool u(const Measured& at, Out u, Problem& problem) override;
-  double lyapunov(const Measured& at, double potential_energy, In w) override;
-  bool slopes(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) override;
-  void by_gains(const Measured& at, const Matrix& Lambda, const Matrix& K_D, Out more) override;
+  TrackingController(Matrix Lambda, Matrix K_D, std::unique_ptr<Trajectory> desired, std::unique_ptr<Core> model,
+                     bool actual);
+  bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override;
+  double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
+  bool derivatives(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  void gain_derivative(const MeasuredState& at, const Matrix& Lambda, const Matrix& K_D, Out derivative) override;
 
  private:
   Matrix Lambda_, K_D_;
-  std::unique_ptr<Motion> desired_;
+  std::unique_ptr<Trajectory> desired_;
   std::unique_ptr<Core> model_;
   bool actual_;
-  bool errors(const Measured& at);
-  Vector e_, e_dot_, v_, a_, r_;  // there: `slopes` reads them
-  Vector product_, turned_, v_model_;
+  bool errors(const MeasuredState& at);
+  Vector e_, e_dot_, v_, a_, r_;  // at the last measured state; `derivatives` uses them
+  Vector product_, Lambda_e_, v_model_;
 };
 
-// Torques that were measured, by time: each until the next one, or lines between them.
-class Torques : public Controller {
+// Torques tabulated over time, piecewise constant or linearly interpolated.
+class TorqueTable : public Controller {
  public:
-  Torques(Vector times, Matrix tau, bool lines) : times_(std::move(times)), tau_(std::move(tau)), lines_(lines) {}
-  bool u(const Measured& at, Out tau, Problem& problem) override;
-  bool of_motors() const override { return true; }
+  TorqueTable(Vector times, Matrix tau, bool interpolates)
+      : times_(std::move(times)), tau_(std::move(tau)), interpolates_(interpolates) {}
+  bool compute_u(const MeasuredState& at, Out tau, ControlFailure& failure) override;
+  bool outputs_torques() const override { return true; }
   bool needs_terms() const override { return false; }
-  bool slopes(Core&, const Indices&, Matrix&, Matrix&) override { return true; }  // none
+  // the torques do not depend on the state
+  bool derivatives(Core&, const Indices&, Matrix&, Matrix&) override { return true; }
 
  private:
   Vector times_;
-  Matrix tau_;  // a column a time
-  bool lines_;
+  Matrix tau_;  // one column per time
+  bool interpolates_;
 };
 
-// From u to tau by motor, limited, and back; or from tau to what it does.
+// Maps u to motor torques within their limits, and motor torques to forces on the tree.
 class Actuation {
  public:
   struct Gear {
     int joint;
-    double turns;  // of the motor by the joint's
+    double ratio;  // motor rate per joint rate
   };
-  Actuation(const Core& core, std::vector<std::vector<Gear>> gears, bool direct, Allocation allocation);
-  void apply(Core& core, Out u, Out tau, Out u_tree);
-  void drive(Out tau, Out u_tree) const;  // torques that are asked for
-  void clip(Out tau) const { allocation_.clip(tau); }
+  Actuation(const Core& core, std::vector<std::vector<Gear>> gears, bool is_direct, Allocation allocation);
+  void allocate(Core& core, Out u, Out tau, Out u_tree);
+  void apply_torques(Out tau, Out u_tree) const;  // clamps the requested torques
+  void clamp(Out tau) const { allocation_.clamp(tau); }
   const std::vector<std::vector<Gear>> gears;
-  const bool direct;  // u is what the motors do
-  bool redundant() const { return allocation_.redundant(); }
-  bool limited(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
+  const bool is_direct;  // the motors act on q directly, so u is their torque
+  bool is_redundant() const { return allocation_.is_redundant(); }
+  bool is_at_limit(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
 
  private:
-  void push(In tau, Out u_tree) const;
+  void motor_forces(In tau, Out u_tree) const;
   Allocation allocation_;
   Matrix transmission_;
 };
 
-// A clock that samples and holds: at k period the state is seen, from k period + delay on what came of it acts.
+// Zero-order hold with a delay: samples at k period, acts from k period + delay.
 struct Sampling {
   double period = 0.0, delay = 0.0;
-  Vector times;        // the instants, if they are not those
-  bool holds = true;   // else what acts has only no derivative there
-  long next = 0;       // the number of the next sample
-  int taken = 0, acted = 0;  // at the instant that was looked at last: samples, and what came to act
-  // A ring of what waits to act, u and when: `first` is the next, `count` how many there are.
-  std::vector<std::pair<double, Vector>> ring;
-  size_t first = 0, count = 0;
+  Vector times;  // sample times, if they are not periodic
+  // false: piecewise smooth control without a hold; only its derivatives jump at the instants
+  bool holds_output = true;
+  long next_sample = 0;                        // index of the next sample
+  int samples_taken = 0, outputs_applied = 0;  // at the last processed instant
+  // ring buffer of outputs waiting for their delay: (time, u)
+  std::vector<std::pair<double, Vector>> queue;
+  size_t queue_begin = 0, queue_size = 0;
 
-  double near(double t) const { return 1e-9 * period + 1e-15 * t; }  // instants nearer than that are one
-  double due() const;      // the next sample
-  double instant() const;  // the next one of the clock
-  void put(double t, In u);
+  double time_tolerance(double t) const { return 1e-9 * period + 1e-15 * t; }  // instants closer than this coincide
+  double next_sample_time() const;
+  double next_instant() const;  // of a sample or of a delayed output
+  void queue_output(double t, In u);
 };
 
 class Control {
  public:
   Control(const Core& core, Actuation actuation);
 
-  std::unique_ptr<Controller> law;  // null: only a constant u acts
+  std::unique_ptr<Controller> law;  // null: only `constant` acts
   std::optional<Sampling> sampling;
   std::optional<Sensor> sensor;
-  std::optional<Drive> drive;
-  Vector constant;          // (d), or by motor
-  bool constant_of_motors = false;
-  Problem problem;
-  Vector u, tau, u_tree;            // what acts: (d), (actuators), (n)
+  std::optional<TorqueDrive> drive;
+  Vector constant;  // (d), or one per motor
+  bool constant_is_torque = false;
+  ControlFailure failure;
+  Vector u, tau, u_tree;  // present values: (d), (motors), (n)
 
-  void begin();  // a run begins: nothing was sampled yet
-  bool acts() const { return law || !constant.isZero(0); }
-  // Let another constant act; false where it is the same.
-  bool hold(In value, bool of_motors);
-  // Whether the motion has to stay in the coordinates q that u is of: the law, or who steps, looks at terms in them, or
-  // eq. 6's force has no other meaning. Torques of motors have one whatever q is.
-  bool needs_own_partition() const;
-  // Whether what acts between samples takes more of the state than q and q_dot.
+  void start();  // reset at the start of a run
+  bool is_active() const { return law || !constant.isZero(0); }
+  // Replace the constant u or torques. False if they are unchanged.
+  bool set_constant(In value, bool outputs_torques);
+  // Whether the motion must stay in the user's partition: the controller or its caller uses terms in it, or u is eq.
+  // 6's force, which depends on it. Motor torques do not.
+  bool needs_fixed_partition() const;
+  // Whether evaluating the control between samples needs more of the state than q and q_dot.
   bool needs_terms() const {
-    return acts() && ((feedback() && law->needs_terms()) || !(actuation_.direct || of_motors()));
+    return is_active() && ((is_feedback() && law->needs_terms()) || !(actuation_.is_direct || outputs_torques()));
   }
-  // Where motors that are not q's own are at limits, as the last `slopes` found them: they do not make u any more.
-  struct Clipped {
-    bool any = false;
-    Matrix answer;       // (motors, d): what those within their limits do to a change of what is wanted of them all
-    Vector tau, lambda;  // what they would do without limits, and what holds against that with u on q
-    Matrix by_q, by_v;   // (motors, n): how their torques change with the state
+  // Motors on other coordinates than q, some of them at their limits: they do not produce u exactly. Set by
+  // `derivatives`.
+  struct LimitedMotors {
+    bool exist = false;
+    Matrix response;     // (motors, d): change of the torques for a change of the requested u
+    Vector tau, lambda;  // torques without limits; multipliers that balance them with u on q
+    Matrix by_q, by_v;   // (motors, n): derivatives of the torques
   };
-  Clipped clipped;
-  // d u' / d q' and d u' / d v' where u' was found last; false where that is not known.
-  // `force`: what acts, where eq. 6's force is meant as that alone on q.
-  bool slopes(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
-  // Whether a motor that is q's own is not at its limit.
-  bool answers(Eigen::Index k) const { return !(direct() && limited(k)); }
-  bool limited(Eigen::Index k) const { return actuation_.limited(tau, k); }  // a motor
-  bool direct() const { return actuation_.direct; }
-  bool redundant() const { return actuation_.redundant(); }
-  bool of_motors() const { return feedback() ? law->of_motors() : constant_of_motors; }  // what acts is their torques
-  // Whether u follows the state between samples.
-  bool feedback() const { return law && !(sampling && sampling->holds); }
-  bool act(const Measured& at);
-  bool sample(const Measured& at, bool& changed);  // at an instant of the clock
-  void settle_u(Core& core);  // eq. 6's force of what acts, in q whatever the core's coordinates are
-  double lyapunov(const Measured& at, double potential_energy, In w);
+  LimitedMotors limited_motors;
+  // Derivatives of the last u_tree with respect to q' and v'. `force` receives the applied force; eq. 6's force is
+  // represented as acting on q alone. False if unknown.
+  bool derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
+  // Whether component k of u responds to the state, i.e. its motor is not at its limit.
+  bool responds(Eigen::Index k) const { return !(is_direct() && is_at_limit(k)); }
+  bool is_at_limit(Eigen::Index k) const { return actuation_.is_at_limit(tau, k); }  // of a motor
+  bool is_direct() const { return actuation_.is_direct; }
+  bool is_redundant() const { return actuation_.is_redundant(); }
+  // whether motor torques are prescribed
+  bool outputs_torques() const { return is_feedback() ? law->outputs_torques() : constant_is_torque; }
+  // Whether u depends on the state between samples.
+  bool is_feedback() const { return law && !(sampling && sampling->holds_output); }
+  bool compute(const MeasuredState& at);
+  bool sample(const MeasuredState& at, bool& changed);  // at an instant of the clock
+  void recover_u(Core& core);                           // eq. 6's force equivalent to what acts, in the fixed partition
+  double lyapunov(const MeasuredState& at, double potential_energy, In w);
 
  private:
-  bool ask(const Measured& at, Out u);
-  bool answer(const Measured& at);  // to a sample: sampled_
-  bool known(In u);                 // finite
-  Measured in_own_q(const Measured& at);
-  bool clip(Core& core, Matrix& by_q, Matrix& by_v);  // those slopes
+  bool evaluate_law(const MeasuredState& at, Out u);
+  bool evaluate_sample(const MeasuredState& at);  // into sample_
+  bool check_finite(In u);                        // stores u in `failure` if it is not finite
+  MeasuredState in_fixed_partition(const MeasuredState& at);
+  bool limited_motor_derivatives(Core& core, Matrix& by_q, Matrix& by_v);
   Actuation actuation_;
-  const Indices own_;  // q, whatever the coordinates of the motion are
-  Vector sampled_, asked_, pushed_, q_, q_dot_, wanted_;
-  Matrix slope_, slope_dot_, to_own_;
+  const Indices fixed_q_;  // q of the user's partition
+  Vector sample_, requested_u_, requested_force_, q_, q_dot_, requested_;
+  Matrix u_by_q_, u_by_v_, to_fixed_q_;
 };
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// Desired trajectories q_d(t) with their first two derivatives: sums of sines, splines, or a point's path.
+// Desired trajectories q_d(t) with two derivatives: sums of sines, splines, or the path of a point.
 #pragma once
 
 #include <memory>
@@ -9,19 +9,19 @@
 
 namespace ckc {
 
-// A function of time with two derivatives.
-class Motion {
+// A vector function of time with two derivatives.
+class Trajectory {
  public:
-  virtual ~Motion() = default;
-  // False where there is none: `problem` says why.
+  virtual ~Trajectory() = default;
+  // Evaluate at t. False if undefined there; `failure` says why.
   virtual bool operator()(double t, Out x, Out x_dot, Out x_ddot) = 0;
-  std::string problem;
+  std::string failure;
 };
 
-class Harmonics : public Motion {
+class HarmonicTrajectory : public Trajectory {
  public:
-  // offset + sum of amplitude sin(frequency t + phase); (size, waves)
-  Harmonics(Vector offset, Matrix amplitude, Matrix frequency, Matrix phase);
+  // offset + sum of amplitude sin(frequency t + phase); matrices are (size, waves).
+  HarmonicTrajectory(Vector offset, Matrix amplitude, Matrix frequency, Matrix phase);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
 
  private:
@@ -29,10 +29,10 @@ class Harmonics : public Motion {
   Matrix amplitude_, frequency_, phase_;
 };
 
-class Spline : public Motion {
+class SplineTrajectory : public Trajectory {
  public:
-  // Polynomials in pieces: by power, the highest first, a row of coefficients a piece.
-  Spline(Vector breaks, std::vector<Matrix> coefficients);
+  // Piecewise polynomials. `coefficients`: one matrix per power, the highest first, with one row per piece.
+  SplineTrajectory(Vector breaks, std::vector<Matrix> coefficients);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
 
  private:
@@ -40,40 +40,46 @@ class Spline : public Motion {
   std::vector<Matrix> coefficients_;
 };
 
-// q_d(t) that takes a point along a path, by Newton's method on Psi(q') = [phi; the point's coordinates].
-class PointMotion : public Motion {
+// q_d(t) that moves a point along a path, by Newton's method on Psi(q') = [phi; coordinates of the point].
+class PointTrajectory : public Trajectory {
  public:
   struct Task {
-    Closure closure;      // of Psi and more
-    Indices psi;          // its n rows that determine q'
-    std::vector<int> axis;  // by row of psi: which of x, y, z it tells, -1 for one that keeps its level
-    Vector level;         // of psi; zero where the path gives it
+    std::string model;      // in Pinocchio's binary format
+    Indices q_index;        // for each tangent coordinate, its index in q'
+    Closure closure;        // contains the rows of Psi
+    Indices psi;            // its n rows that determine q'
+    std::vector<int> axis;  // by row of psi: which of x, y, z it prescribes, -1 for a constant
+    Vector level;           // values of psi; zero where the path prescribes them
   };
-  // `knots`: configurations along the path, (nq, count), at `times`; past `end` the path leaves the workspace.
-  PointMotion(const std::string& model, Indices place, Task task, std::unique_ptr<Motion> path, Indices q,
-              Vector times, Matrix knots, double tolerance, double end, std::string past_end);
+  // Configurations along the path, (nq, count), at their times. After `end` the path leaves the workspace.
+  struct Knots {
+    Vector times;
+    Matrix configurations;
+    double end;
+    std::string past_end_message;
+  };
+  // `path`: of the point; `q`: the coordinates of q_d; `tolerance`: of |Psi|.
+  PointTrajectory(Task task, std::unique_ptr<Trajectory> path, Indices q, Knots knots, double tolerance);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
 
  private:
-  static constexpr int nodes = 3;  // of the interpolation between knots, of degree 5
-  bool place();  // psi's rows at q_tree_; false where they are not finite, or determine nothing
-  bool close();
-  void fill(const Vector& path, const Vector* level);  // wanted_, one of psi's rows each
+  static constexpr int nodes = 3;  // points interpolated between knots, by polynomials of degree 5
+  bool update_rows();              // at q_tree_; false if they are not finite or singular
+  bool solve();
+  void set_target(const Vector& path, const Vector* level);  // right-hand sides of the rows of psi
   bool knot_rate(Eigen::Index knot);
-  bool predict(double t, Eigen::Index first);  // q_tree_, from the knots from there on
+  bool predict(double t, Eigen::Index first);  // q_tree_ from the knots beginning with `first`
 
   Tree tree_;
-  Rows rows_;
+  ConstraintRows constraints_;
   Task task_;
-  std::unique_ptr<Motion> path_;
+  std::unique_ptr<Trajectory> path_;
   Indices q_;
-  Vector times_;
-  Matrix knots_;
-  double tolerance_, end_;
-  std::string past_end_;
-  Matrix rates_;             // (n, count): how fast it moves at the knots,
-  std::vector<char> known_;  // of which that was found; some are asked for, and the last may be singular
-  Vector q_tree_, units_, v_, a_, wanted_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
+  Knots knots_;
+  double tolerance_;
+  Matrix rates_;                     // (n, count): rates at the knots, computed on demand
+  std::vector<char> rate_is_known_;  // the last knot may be singular
+  Vector q_tree_, units_, v_, a_, target_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
   Matrix J_;
   Factor factor_;
 };

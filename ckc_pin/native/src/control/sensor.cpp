@@ -4,10 +4,10 @@
 
 namespace ckc {
 
-constexpr int most_steps = 12;
-constexpr double longest = 0.5, negligible = 1e-9;  // rad, or of the mechanism's size: Newton's steps, first and last
+constexpr int max_newton_steps = 12;
+constexpr double max_newton_step = 0.5, newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
 
-// Steele, Lea & Flood's SplitMix64, its upper 53 bits.
+// SplitMix64 of Steele, Lea and Flood, upper 53 bits.
 double Noise::uniform() {
   std::uint64_t z = (state_ += 0x9e3779b97f4a7c15u);
   z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
@@ -15,8 +15,8 @@ double Noise::uniform() {
   return (static_cast<double>((z ^ (z >> 31)) >> 11) + 0.5) * 0x1p-53;
 }
 
-// The natural logarithm by its series in (m - 1) / (m + 1), m between sqrt(1/2) and sqrt(2).
-static double logarithm(double x) {
+// Natural logarithm by its series in (m - 1) / (m + 1), with m between sqrt(1/2) and sqrt(2).
+static double portable_log(double x) {
   int exponent;
   double m = std::frexp(x, &exponent);
   if (m < 0.70710678118654752) m *= 2, --exponent;
@@ -26,62 +26,62 @@ static double logarithm(double x) {
   return exponent * 0.69314718055994531 + 2 * r * sum;
 }
 
-// Marsaglia's polar method; of each pair the first.
+// Marsaglia's polar method, using the first number of each pair.
 double Noise::normal() {
   for (;;) {
     const double x = 2 * uniform() - 1, y = 2 * uniform() - 1, s = x * x + y * y;
-    if (s < 1 && s > 0) return x * std::sqrt(-2 * logarithm(s) / s);
+    if (s < 1 && s > 0) return x * std::sqrt(-2 * portable_log(s) / s);
   }
 }
 
-void Sensor::begin() {
-  noise_.begin(seed);
-  begun_ = false;
-  for (Vector* x : {&q, &q_dot, &before_}) x->setZero(resolution.size());
+void Sensor::reset() {
+  noise_.reset(seed);
+  has_measured_ = false;
+  for (Vector* x : {&q, &q_dot, &previous_q_}) x->setZero(resolution.size());
   if (observer) v_tree.setZero(observer->n), q_tree_.setZero(observer->tree.nq), step_.setZero(observer->n);
 }
 
-void Sensor::look(In q_true, In q_dot_true, double period) {
+void Sensor::measure(In q_true, In q_dot_true, double period) {
   const auto d = resolution.size();
-  before_ = q;
+  previous_q_ = q;
   for (Eigen::Index k = 0; k < d; ++k) {
     q(k) = q_true(k) + q_noise(k) * noise_.normal();
     if (resolution(k) > 0) q(k) = resolution(k) * std::floor(q(k) / resolution(k) + 0.5);
   }
   for (Eigen::Index k = 0; k < d; ++k) {
     double rate = q_dot_true(k) + q_dot_noise(k) * noise_.normal();
-    if (differences) rate = begun_ ? (q(k) - before_(k)) / period : 0.0;
-    q_dot(k) = begun_ ? q_dot(k) + smoothing * (rate - q_dot(k)) : rate;
+    if (differentiates) rate = has_measured_ ? (q(k) - previous_q_(k)) / period : 0.0;
+    q_dot(k) = has_measured_ ? q_dot(k) + smoothing * (rate - q_dot(k)) : rate;
   }
-  begun_ = true;
+  has_measured_ = true;
 }
 
-bool Sensor::close(In q_tree) {
+bool Sensor::project_observer(In q_tree) {
   Core& core = *observer;
   q_tree_ = q_tree;
-  for (int k = 0; k < core.d; ++k) q_tree_(core.tree.place[core.q[k]]) = q(k);
-  double size = core.rank ? longest : 0.0;
-  for (int step = 0; step <= most_steps; ++step) {
-    core.set(q_tree_);
-    core.factor();
-    if (size <= negligible) break;
-    if (core.phi_z.singular() || step == most_steps) return false;
-    core.z_step(core.rows.phi, step_);
+  for (int k = 0; k < core.d; ++k) q_tree_(core.tree.q_index[core.q[k]]) = q(k);
+  double size = core.rank ? max_newton_step : 0.0;
+  for (int step = 0; step <= max_newton_steps; ++step) {
+    core.set_configuration(q_tree_);
+    core.factorize_phi_z();
+    if (size <= newton_tolerance) break;
+    if (core.phi_z.singular() || step == max_newton_steps) return false;
+    core.closure_step_in_z(core.constraints.phi, step_);
     size = step_.size() ? step_.cwiseQuotient(core.scales.columns).lpNorm<Eigen::Infinity>() : 0.0;
-    if (!(size <= longest)) return false;
+    if (!(size <= max_newton_step)) return false;
     core.tree.integrate(q_tree_, step_);
   }
-  core.reduce();
-  core.velocity(q_dot, v_tree);
+  core.compute_rho();
+  core.multiply_rho(q_dot, v_tree);
   core.set_velocity(v_tree);
   return true;
 }
 
-void Drive::limit(Out tau, double period) {
+void TorqueDrive::limit_and_quantize(Out tau, double period) {
   for (Eigen::Index k = 0; k < tau.size(); ++k) {
-    const double most = rate(k) * period;
-    sent(k) += std::min(std::max(tau(k) - sent(k), -most), most);
-    tau(k) = resolution(k) > 0 ? resolution(k) * std::floor(sent(k) / resolution(k) + 0.5) : sent(k);
+    const double max_change = rate(k) * period;
+    output(k) += std::min(std::max(tau(k) - output(k), -max_change), max_change);
+    tau(k) = resolution(k) > 0 ? resolution(k) * std::floor(output(k) / resolution(k) + 0.5) : output(k);
   }
 }
 

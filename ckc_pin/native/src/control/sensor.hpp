@@ -1,4 +1,4 @@
-// What a computer sees of a state, and what its drives make of the torques it asks for.
+// Sensors and torque drives of a digital controller.
 #pragma once
 
 #include <cstdint>
@@ -8,10 +8,11 @@
 
 namespace ckc {
 
-// Normal numbers that are the same on every machine: no function of the C library but the square root, which IEEE 754 fixes.
+// Normal random numbers that are identical on every machine. Of the C library it uses only sqrt, which IEEE 754
+// defines.
 class Noise {
  public:
-  void begin(std::uint64_t seed) { state_ = seed; }
+  void reset(std::uint64_t seed) { state_ = seed; }
   double normal();
 
  private:
@@ -19,33 +20,34 @@ class Noise {
   std::uint64_t state_ = 0;
 };
 
-// Encoders with steps and noise, rates measured or by differences, filtered; at the clock's instants alone.
+// Encoders with resolution and noise. Rates are measured or differenced, then filtered. Evaluated at the clock's
+// instants.
 class Sensor {
  public:
   Vector resolution, q_noise, q_dot_noise;  // (d); 0 where there is none
-  bool differences = false;
-  double smoothing = 1.0;  // of a new rate in the filtered one
+  bool differentiates = false;
+  double smoothing = 1.0;  // weight of a new rate in the filter
   std::uint64_t seed = 0;
-  std::unique_ptr<Core> observer;  // closed at what is measured
+  std::unique_ptr<Core> observer;  // mechanism at the measured configuration
 
-  void begin();
-  // Look at q and q_dot, which then are what is measured.
-  void look(In q_true, In q_dot_true, double period);
-  // Close the observer's loops at that, from a configuration near; false where they do not close.
-  bool close(In q_tree);
+  void reset();
+  // Measure q and q_dot, which are stored in `q` and `q_dot`.
+  void measure(In q_true, In q_dot_true, double period);
+  // Project the observer onto the constraint manifold at the measured q, starting from q_tree. False if that fails.
+  bool project_observer(In q_tree);
   Vector q, q_dot, v_tree;
 
  private:
   Noise noise_;
-  bool begun_ = false;
-  Vector before_, q_tree_, step_;
+  bool has_measured_ = false;
+  Vector previous_q_, q_tree_, step_;
 };
 
-// Quantised torques that cannot jump.
-struct Drive {
+// Torque outputs with limited resolution and rate.
+struct TorqueDrive {
   Vector resolution, rate;  // by motor, N m and N m/s; 0 and infinite where there is none
-  Vector sent;              // before it is quantised
-  void limit(Out tau, double period);
+  Vector output;            // before quantization
+  void limit_and_quantize(Out tau, double period);
 };
 
 }  // namespace ckc

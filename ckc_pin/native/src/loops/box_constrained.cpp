@@ -10,39 +10,41 @@ namespace ckc {
 
 namespace qp = proxsuite::proxqp;
 
-constexpr double exactly = 1e-12;  // of the program, whose numbers are about one
-constexpr double accepted = 1e-11; // of the largest number of x: how far it may be from optimal
-constexpr double at_bound = 1e-9;  // of the largest number of x: so close to its bound a number is at it
-constexpr double far = 1e8;        // a bound that is never met
-constexpr long most_iterations = 10000;
-constexpr double parallel = 1e-12;  // of a direction whose rows are about one: it does not move along
+constexpr double solver_tolerance = 1e-12;  // of a problem scaled to numbers of about one
+constexpr double max_residual = 1e-11;      // of the largest |x|: accepted optimality residual
+constexpr double bound_tolerance = 1e-9;    // of the largest |x|: distance at which a variable counts as at its bound
+constexpr double infinite_bound = 1e8;      // stands for an infinite bound
+constexpr long max_iterations = 10000;
+constexpr double direction_tolerance = 1e-12;  // below it a direction of rows of about unit norm counts as zero
 
 namespace {
 
-// How far x is from what a step along the gradient makes of it within the box: zero at the minimum.
+// Optimality residual: the change of x by one projected gradient step. It is zero at the minimum.
 double residual(const Matrix& A, In b, In lower, In upper, const Vector& x) {
   const Vector gradient = A * x + b;
   return (x - (x - gradient).cwiseMax(lower).cwiseMin(upper)).lpNorm<Eigen::Infinity>();
 }
 
-// Solve for the numbers that are off their bounds once more, to rounding: the smallest ones, or those next to x.
-void polish(const Matrix& A, In b, In lower, In upper, Vector& x) {
-  const double apart = at_bound * std::max(1.0, x.lpNorm<Eigen::Infinity>());
-  Indices inside;
+// Solve for the variables that are not at their bounds once more, to rounding. Tries the minimum-norm solution, then
+// the one closest to x.
+void refine(const Matrix& A, In b, In lower, In upper, Vector& x) {
+  const double tolerance = bound_tolerance * std::max(1.0, x.lpNorm<Eigen::Infinity>());
+  Indices off_bounds;
   Vector bound = x;
   for (Eigen::Index i = 0; i < x.size(); ++i)
-    if (x(i) - lower(i) > apart && upper(i) - x(i) > apart) inside.push_back(static_cast<int>(i)), bound(i) = 0.0;
-  if (inside.empty()) return;
+    if (x(i) - lower(i) > tolerance && upper(i) - x(i) > tolerance)
+      off_bounds.push_back(static_cast<int>(i)), bound(i) = 0.0;
+  if (off_bounds.empty()) return;
   Eigen::CompleteOrthogonalDecomposition<Matrix> factors;
-  factors.setThreshold(parallel);
-  factors.compute(A(inside, inside));
-  for (const Vector& from : {bound, x}) {
-    const Vector gradient = A * from + b;
-    Vector polished = from;
-    polished(inside) -= factors.solve(gradient(inside));
-    polished = polished.cwiseMax(lower).cwiseMin(upper);
-    if (residual(A, b, lower, upper, polished) <= std::max(residual(A, b, lower, upper, x), exactly)) {
-      x = polished;
+  factors.setThreshold(direction_tolerance);
+  factors.compute(A(off_bounds, off_bounds));
+  for (const Vector& start : {bound, x}) {
+    const Vector gradient = A * start + b;
+    Vector refined = start;
+    refined(off_bounds) -= factors.solve(gradient(off_bounds));
+    refined = refined.cwiseMax(lower).cwiseMin(upper);
+    if (residual(A, b, lower, upper, refined) <= std::max(residual(A, b, lower, upper, x), solver_tolerance)) {
+      x = refined;
       return;
     }
   }
@@ -50,58 +52,60 @@ void polish(const Matrix& A, In b, In lower, In upper, Vector& x) {
 
 }  // namespace
 
-bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
+bool minimize_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   const auto n = A.rows();
   if (n == 1 && A(0, 0) > 0.0) {
     x.setConstant(1, std::min(std::max(-b(0) / A(0, 0), lower(0)), upper(0)));
     return true;
   }
   qp::dense::QP<double> program(n, 0, 0, true);
-  program.settings.eps_abs = exactly, program.settings.eps_rel = 0.0;
-  program.settings.max_iter = most_iterations;
+  program.settings.eps_abs = solver_tolerance, program.settings.eps_rel = 0.0;
+  program.settings.max_iter = max_iterations;
   const auto none = proxsuite::nullopt;
-  const Vector cost = b, low = lower.cwiseMax(-far), high = upper.cwiseMin(far);
+  const Vector cost = b, low = lower.cwiseMax(-infinite_bound), high = upper.cwiseMin(infinite_bound);
   program.init(A, cost, none, none, none, none, none, low, high);
   program.solve();
   x = program.results.x.cwiseMax(lower).cwiseMin(upper);
   if (!x.allFinite()) return false;
-  polish(A, b, lower, upper, x);
+  refine(A, b, lower, upper, x);
   const bool solved = program.results.info.status == qp::QPSolverOutput::PROXQP_SOLVED;
-  return solved || residual(A, b, lower, upper, x) <= accepted * std::max(1.0, x.lpNorm<Eigen::Infinity>());
+  return solved || residual(A, b, lower, upper, x) <= max_residual * std::max(1.0, x.lpNorm<Eigen::Infinity>());
 }
 
-// A linear program in (x, s), at most a few unknowns, from the feasible point x = 0 by an active-set method: go along the
-// working set's null space while s grows, then leave the row with the first negative multiplier (Bland's rule).
-double largest_slack(const Matrix& N, In y, In lower, In upper) {
+// A linear program in (x, s), solved with an active-set method from the feasible point x = 0. Follow the null space
+// of the working set while s grows, then drop the first row with a negative multiplier (Bland's rule).
+double maximize_slack(const Matrix& N, In y, In lower, In upper) {
   constexpr double infinity = std::numeric_limits<double>::infinity();
   const Eigen::Index m = N.rows(), size = N.cols() + 1;
   Matrix rows(2 * m, size);  // rows (x, s) <= limits
   Vector limits(2 * m);
   Eigen::Index count = 0;
-  const auto limit = [&](Eigen::Index i, double side, double room) {
+  const auto add_limit = [&](Eigen::Index i, double side, double room) {
     if (!std::isfinite(room)) return;
     rows.row(count) << side * N.row(i), 1.0;
     limits(count) = room;
     ++count;
   };
-  for (Eigen::Index i = 0; i < m; ++i) limit(i, 1.0, upper(i) - y(i)), limit(i, -1.0, y(i) - lower(i));
+  for (Eigen::Index i = 0; i < m; ++i) add_limit(i, 1.0, upper(i) - y(i)), add_limit(i, -1.0, y(i) - lower(i));
   if (!count) return infinity;
   Vector point = Vector::Zero(size);
   Eigen::Index first;
   point(size - 1) = limits.head(count).minCoeff(&first);
   std::vector<Eigen::Index> working{first};
   const Vector objective = Vector::Unit(size, size - 1);
-  const long most = 50 * (count + size);
-  for (long k = 0; k < most; ++k) {
+  const long max_steps = 50 * (count + size);
+  for (long k = 0; k < max_steps; ++k) {
     Matrix active(size, static_cast<Eigen::Index>(working.size()));
-    for (size_t i = 0; i < working.size(); ++i) active.col(static_cast<Eigen::Index>(i)) = rows.row(working[i]).transpose();
+    for (size_t i = 0; i < working.size(); ++i)
+      active.col(static_cast<Eigen::Index>(i)) = rows.row(working[i]).transpose();
     const Eigen::ColPivHouseholderQR<Matrix> qr(active);
     const Vector multipliers = qr.solve(objective);
     const Vector direction = objective - active * multipliers;
-    if (direction.norm() <= parallel) {
+    if (direction.norm() <= direction_tolerance) {
       size_t leaving = working.size();
       for (size_t i = 0; i < working.size(); ++i)
-        if (multipliers(static_cast<Eigen::Index>(i)) < -parallel && (leaving == working.size() || working[i] < working[leaving]))
+        if (multipliers(static_cast<Eigen::Index>(i)) < -direction_tolerance &&
+            (leaving == working.size() || working[i] < working[leaving]))
           leaving = i;
       if (leaving == working.size()) break;
       working.erase(working.begin() + static_cast<std::ptrdiff_t>(leaving));
@@ -111,7 +115,7 @@ double largest_slack(const Matrix& N, In y, In lower, In upper) {
     Eigen::Index blocking = -1;
     for (Eigen::Index i = 0; i < count; ++i) {
       const double rate = rows.row(i).dot(direction);
-      if (!(rate > parallel) || std::find(working.begin(), working.end(), i) != working.end()) continue;
+      if (!(rate > direction_tolerance) || std::find(working.begin(), working.end(), i) != working.end()) continue;
       const double room = std::max(limits(i) - rows.row(i).dot(point), 0.0) / rate;
       if (room < step) step = room, blocking = i;
     }

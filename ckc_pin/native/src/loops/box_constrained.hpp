@@ -1,16 +1,16 @@
-// Small convex programs in a box.
+// Small convex programs with box constraints.
 #pragma once
 
 #include "tree/types.hpp"
 
 namespace ckc {
 
-// The x that makes x^T A x / 2 + b^T x least between `lower` and `upper`, A positive semidefinite; false where the
-// solver does not find it. Where A is singular x need not be unique, A x is.
-bool least_in_box(const Matrix& A, In b, In lower, In upper, Vector& x);
+// Minimize x^T A x / 2 + b^T x with lower <= x <= upper, A positive semidefinite. If A is singular, A x is unique but
+// x need not be. False if the solver does not converge.
+bool minimize_in_box(const Matrix& A, In b, In lower, In upper, Vector& x);
 
-// The largest s for which some x has lower + s <= y + N x <= upper - s: how far y can be kept away from its bounds by
-// what N adds to it, negative where it cannot be within them. Infinite where nothing limits it.
-double largest_slack(const Matrix& N, In y, In lower, In upper);
+// Return the largest s for which some x satisfies lower + s <= y + N x <= upper - s. It is negative if y + N x cannot
+// be within its bounds, and infinite if there are no bounds.
+double maximize_slack(const Matrix& N, In y, In lower, In upper);
 
 }  // namespace ckc

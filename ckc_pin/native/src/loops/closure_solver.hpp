@@ -1,30 +1,32 @@
-// Newton's method on z, and the way from a closed configuration to another q: what `sigma` of the readable reference does
-// along its straight line. Where that ends early nobody says why; the reference does.
+// Projection onto the constraint manifold by Newton's method on z, and continuation along q. It does the same as
+// `sigma` of the readable Python reference, but does not say why it fails.
 #pragma once
 
 #include "loops/core.hpp"
 
 namespace ckc {
 
-class Closing {
+class ClosureSolver {
  public:
-  explicit Closing(Core& core);
+  explicit ClosureSolver(Core& core);
 
-  // Close phi(q, z) = w on z from q_tree, the largest part that z can close to `tolerance`, or to rounding; false where
-  // that is not got to. J and phi_z's factorization are those of where the core is then.
-  bool close(In q_tree, In w, double tolerance, bool to_rounding = false);
-  // From where the core is, closed, along the straight line to q; false where that cannot be followed on its branch, or
-  // phi_z is singular at its end. Joints of one freedom alone.
-  bool move(In q, double tolerance);
+  // Solve phi(q, z) = w for z, starting from q_tree, to `tolerance` or to rounding. Only the part of the residual
+  // that z can correct counts. Afterwards the core is at the solution, with J and phi_z factorized. False if it does
+  // not converge.
+  bool project(In q_tree, In w, double tolerance, bool to_rounding = false);
+  // Move from the core's configuration along the straight line to q, staying on the same branch. False if that fails
+  // or phi_z is singular at the end. Joints with one degree of freedom only.
+  bool continue_to(In q, double tolerance);
 
-  long corrections = 0;
-  int expected = -1;  // corrections after which D' will be wanted, and which the last time took; negative: it will not
+  long newton_steps = 0;
+  // Newton steps after which D' is likely needed, and which the last projection took; negative: D' is not needed
+  int expected_steps = -1;
 
  private:
-  double unclosed();  // of residual_
+  double residual_size();  // reduces residual_ to what z can correct
 
   Core& core_;
-  Vector q_tree_, at_, step_, residual_, z_, dq_, none_;
+  Vector q_tree_, base_, step_, residual_, z_, q_step_, zero_level_;
 };
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// A mechanism's terms written out as C for it alone: the library that `ckc_pin.generated` compiled and checked.
+// Terms compiled as C code for one mechanism: the library that `ckc_pin.codegen` has written, compiled and checked.
 #pragma once
 
 #include <string>
@@ -8,77 +8,80 @@
 
 namespace ckc {
 
-class Written {
+class CompiledTerms {
  public:
-  // The library at `path`, and the numbers of the mechanism that its code takes.
-  Written(const std::string& path, In parameters);
-  ~Written();
-  Written(const Written&) = delete;
+  // Load the library at `path` for the given parameters of the mechanism.
+  CompiledTerms(const std::string& path, In parameters);
+  ~CompiledTerms();
+  CompiledTerms(const CompiledTerms&) = delete;
 
-  void vary(In parameters);  // other numbers
-  long long parameters() const { return taken_; }
+  void set_parameters(In parameters);
+  long long parameter_count() const { return parameter_count_; }
 
-  void place(In q, Out phi, Matrix& J) const;
-  void inertia(In q, Matrix& D_tree) const;
-  void bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const;
-  void jacobian_rate(In q, In v, Matrix& J_dot) const;
-  void rest(In q, Out h_tree) const;  // h' less what springs do
-  // C' x; only of trees whose joints have one freedom each: of a free root's twist there are several C'.
-  void coriolis(In q, In v, In x, Out product) const;
-  bool has_coriolis() const { return coriolis_; }
+  void evaluate_closure(In q, Out phi, Matrix& J) const;
+  void evaluate_D_tree(In q, Matrix& D_tree) const;
+  void evaluate_bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const;
+  void evaluate_J_dot(In q, In v, Matrix& J_dot) const;
+  void evaluate_h_tree(In q, Out h_tree) const;  // h' without springs
+  // C' x. Only if all joints have one degree of freedom: C' of a free root is not unique.
+  void multiply_C_tree(In q, In v, In x, Out product) const;
+  bool has_coriolis() const { return coriolis_code_; }
   double potential_energy(In q) const;
-  // Whether what is eliminated below may be used: in the numbers in use it may round too much (loops/elimination_check.hpp). Where it
-  // may not, all of it says false; `eliminate` is the acceleration all the same.
-  void allow_elimination(bool allowed) { eliminates_ = allowed; }
-  bool eliminates() const { return eliminates_; }
-  // Eq. 1 by elimination without pivoting; false where it would have to pivot.
+  // Whether the functions that eliminate without pivoting may be used (loops/elimination_check.hpp decides). If not,
+  // they return false; only `eliminate` still computes the acceleration.
+  void allow_elimination(bool allowed) { elimination_allowed_ = allowed; }
+  bool allows_elimination() const { return elimination_allowed_; }
+  // Acceleration of eq. 1 by elimination without pivoting. False if a pivot would be needed.
   bool acceleration(In q, In v, In u_tree, In correction, Out acceleration) const {
-    return eliminates_ && eliminate(q, v, u_tree, correction, acceleration);
+    return elimination_allowed_ && eliminate(q, v, u_tree, correction, acceleration);
   }
   bool eliminate(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // How that changes: at a state, and then along a direction, a step of q', a change of v', and `more`: of u', and of
-  // J v'_dot by the rows that are kept; or along as many at a time as there are lanes, a row each, where there are more
-  // than one. Only of a library made for it. False as above, and no changes there are known.
-  bool has_changes() const { return state_; }
+  // Directional derivatives of the acceleration, if the library has them. `prepare_derivatives` fixes the state;
+  // false as above. A direction is (step of q', change of v', `added`), where `added` are changes of u' and of J
+  // v'_dot in the rows that are kept. `directional_derivatives` takes `lanes` directions at a time, one per row.
+  bool has_directional_derivatives() const { return state_code_; }
   int lanes() const { return lanes_; }
-  int directions() const { return directions_; }  // how many numbers one is
-  bool state(In q, In v, In u_tree) const;
-  void change(In direction, Out acceleration) const;
-  void changes(const Matrix& directions, Matrix& acceleration) const;  // (lanes, ...), (lanes, n)
-  // The groups of parameters that a change of them is of, and what such a group adds to `more`.
-  Indices groups(In varied) const;
-  void varied(int group, In varied, Out more) const;
-  // The x with J x = -residual that is smallest in the metric of D'; false as above.
-  bool closing_step(In q, In residual, Out x) const;
-  // d (q'_dot, v'_dot) / d (q', v') and d v'_dot / d u'; false as above, or where that was too long to be written.
-  bool jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const;
+  int direction_size() const { return direction_size_; }
+  bool prepare_derivatives(In q, In v, In u_tree) const;
+  void directional_derivative(In direction, Out acceleration) const;
+  // (lanes, direction_size) -> (lanes, n)
+  void directional_derivatives(const Matrix& directions, Matrix& acceleration) const;
+  // Groups of parameters that a parameter direction involves, and what one of the groups contributes to `added`.
+  Indices parameter_groups(In direction) const;
+  void parameter_direction(int group, In direction, Out added) const;
+  // Step x with J x = -residual, minimum-norm in the metric of D'. False as above.
+  bool closure_step(In q, In residual, Out x) const;
+  // Derivatives of (q'_dot, v'_dot) with respect to (q', v'), and of v'_dot with respect to u'. False as above, or if
+  // the library has no such function.
+  bool evaluate_jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const;
 
  private:
   using Code = int (*)(const double**, double**, long long*, double*, int);
-  void* symbol(const std::string& name) const;
-  Code code(const char* name, int arguments) const;     // of so many
-  Code perhaps(const char* name, int arguments) const;  // null where there is none
-  long long size(const char* of, long long k = 0) const;
-  bool find_state(In q, In v, In u_tree) const;  // one that was not asked for last
+  void* find_symbol(const std::string& name) const;
+  Code find_code(const char* name, int arguments) const;           // checks the number of arguments
+  Code find_optional_code(const char* name, int arguments) const;  // null if the library has none
+  long long sparsity_size(const char* of, long long k = 0) const;
+  bool compute_state(In q, In v, In u_tree) const;  // evaluates at another state than the last one
 
   // Cosines and sines of q, which most functions of one state share.
-  const double* trig(In q) const { return trig_.of(q); }
+  const double* trig(In q) const { return trig_.cosines_and_sines(q); }
 
   void* library_;
-  long long taken_ = 0;  // parameters: to look a function up takes longer than to call it
-  Vector numbers_;  // the parameters, and what follows from them alone
+  long long parameter_count_ = 0;  // stored because looking it up takes longer than a call
+  Vector constants_;               // the parameters and everything that depends on them alone
   mutable Trig trig_;
-  struct alignas(64) Line {  // of the processor's cache: what is read four at a time is in one
+  struct alignas(64) Line {  // one cache line, so that four numbers that are read at once are in one line
     double x[8];
   };
-  mutable Vector q_, v_, u_, acceleration_at_;  // the last state that changes were asked for,
-  mutable std::vector<Line> known_;             // and what is known there
-  mutable bool sound_ = false;
-  bool eliminates_ = true;
-  int lanes_ = 1, directions_ = 0;
-  Code given_, place_, inertia_, bias_, jacobian_rate_, rest_, coriolis_, potential_energy_, acceleration_, closing_step_, jacobian_;
-  Code state_, change_, changes_, groups_;
-  std::vector<Code> varied_;
+  mutable Vector q_, v_, u_, acceleration_at_;  // the last state of `prepare_derivatives`
+  mutable std::vector<Line> state_data_;        // and its intermediate results
+  mutable bool is_sound_ = false;
+  bool elimination_allowed_ = true;
+  int lanes_ = 1, direction_size_ = 0;
+  Code constants_code_, closure_code_, inertia_code_, bias_code_, J_dot_code_, h_tree_code_, coriolis_code_,
+      potential_energy_code_, acceleration_code_, closure_step_code_, jacobian_code_;
+  Code state_code_, change_code_, changes_code_, groups_code_;
+  std::vector<Code> parameter_codes_;
 };
 
 }  // namespace ckc

@@ -8,174 +8,178 @@
 
 namespace ckc {
 
-constexpr int small = 12;        // coordinates
-constexpr double crowded = 0.2;  // share of D' that is not zero, from which a product with all of it costs less
+constexpr int max_small_size = 12;       // in coordinates
+constexpr double min_dense_share = 0.2;  // nonzero share of D' from which dense products are faster
 
-Core::Core(const std::string& model, Indices place, Closure closure, SpringTable table, JointTable joint_table,
-           int rank_, Scales scales_, std::unique_ptr<Written> written_)
-    : tree(model, std::move(place)),
-      rows(tree, std::move(closure)),
-      springs(tree, std::move(table)),
-      joints(std::move(joint_table), tree.n),
+Core::Core(CoreTable table)
+    : tree(table.model, std::move(table.q_index)),
+      constraints(tree, std::move(table.closure)),
+      springs(tree, std::move(table.springs)),
+      joints(std::move(table.joints), tree.n),
       n(tree.n),
-      rank(rank_),
-      scales(std::move(scales_)),
+      rank(table.rank),
+      scales(std::move(table.scales)),
       d(0),
-      written(std::move(written_)),
-      derivatives(tree, rows.closure, springs.table),
-      qr_(std::max(rows.closure.rows, 1), n) {
-  const int m = rows.closure.rows;
-  q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n), J_dot_v.setZero(m);
-  C_tree_.setZero(n, n), damping_tree.setZero(n), D_written_.setZero(n, n);
+      compiled(std::move(table.compiled)),
+      derivatives(tree, constraints.closure, springs.table),
+      qr_(std::max(constraints.closure.rows, 1), n) {
+  const int m = constraints.closure.rows;
+  q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n),
+      J_dot_v.setZero(m);
+  C_tree_.setZero(n, n), damping_tree.setZero(n), D_compiled_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
-  effort_.setZero(n), lambda_.setZero(m), turned_.setZero(m), negative_.setZero(m);
-  tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), free_.resize(n - rank);
-  square_.setZero(n - rank, n - rank), square_factor_.shape(n - rank);
-  moved_.setZero(n), small_.setZero(n - rank), small_b_.setZero(n - rank);
+  lacking_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
+  tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
+  tangent_matrix_.setZero(n - rank, n - rank), tangent_factor_.shape(n - rank);
+  rho_times_x_.setZero(n), tangent_solution_.setZero(n - rank), tangent_rhs_.setZero(n - rank);
   size_t entries = 0;
   for (const Indices& above : tree.ancestors) entries += 2 * above.size();
-  dense_ = n > small && static_cast<double>(entries) > crowded * n * n;
+  D_tree_is_dense_ = n > max_small_size && static_cast<double>(entries) > min_dense_share * n * n;
 }
 
 Core::~Core() = default;
 
-void Core::split(Indices q_, Indices z_) {
+void Core::set_partition(Indices q_, Indices z_) {
   q = std::move(q_), z = std::move(z_);
   d = static_cast<int>(q.size());
-  const int m = rows.closure.rows, k = static_cast<int>(z.size());
-  const auto pattern = rows.pattern_of(z, n);
+  const int m = constraints.closure.rows, k = static_cast<int>(z.size());
+  const auto pattern = constraints.pattern_in(z, n);
   phi_z.shape(m, k, pattern), basis_.shape(m, k, pattern);
-  basis_q_ = q, basis_z_ = z, basis_at_ = -1;
+  basis_q_ = q, basis_z_ = z, basis_configuration_ = -1;
   D_factor.shape(d);
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
 
-Eigen::Index Core::size_of(Number what) const {
-  const Eigen::Index m = rows.closure.rows;
+Eigen::Index Core::parameter_size(Parameter what) const {
+  const Eigen::Index m = constraints.closure.rows;
   switch (what) {
-    case Number::gravity: return 3;
-    case Number::offset: case Number::centre: return 3 * tree.joints;
-    case Number::mass: return tree.joints;
-    case Number::inertia: return 9 * tree.joints;
-    case Number::point: return 3 * static_cast<Eigen::Index>(rows.closure.point_local.size());
-    case Number::length: case Number::affine_offset: return m;
-    case Number::affine: return m * n;
-    case Number::end: return 6 * springs.count();
-    case Number::stiffness: case Number::rest_length: case Number::damping: return springs.count();
-    case Number::written: return written ? written->parameters() : 0;
+    case Parameter::gravity: return 3;
+    case Parameter::offset:
+    case Parameter::centre: return 3 * tree.joints;
+    case Parameter::mass: return tree.joints;
+    case Parameter::inertia: return 9 * tree.joints;
+    case Parameter::point: return 3 * static_cast<Eigen::Index>(constraints.closure.point_local.size());
+    case Parameter::length:
+    case Parameter::affine_offset: return m;
+    case Parameter::affine: return m * n;
+    case Parameter::end: return 6 * springs.count();
+    case Parameter::stiffness:
+    case Parameter::rest_length:
+    case Parameter::damping: return springs.count();
+    case Parameter::compiled: return compiled ? compiled->parameter_count() : 0;
     default: return n;
   }
 }
 
-void Core::vary(Number what, In numbers) {
+void Core::set_parameters(Parameter what, In numbers) {
   const int k = static_cast<int>(what);
-  const auto from = [k](Number first) { return k - static_cast<int>(first); };
-  if (what == Number::written)
-    written->vary(numbers);
-  else if (what >= Number::end)
-    springs.vary(static_cast<Springs::Number>(from(Number::end)), numbers);
-  else if (what >= Number::point)
-    rows.vary(static_cast<Rows::Number>(from(Number::point)), numbers);
+  const auto from = [k](Parameter first) { return k - static_cast<int>(first); };
+  if (what == Parameter::compiled)
+    compiled->set_parameters(numbers);
+  else if (what >= Parameter::end)
+    springs.set_parameters(static_cast<Springs::Parameter>(from(Parameter::end)), numbers);
+  else if (what >= Parameter::point)
+    constraints.set_parameters(static_cast<ConstraintRows::Parameter>(from(Parameter::point)), numbers);
   else
-    tree.vary(static_cast<Tree::Number>(k), numbers);
-  here_ = 0, basis_at_ = -1, ++sets;
+    tree.set_parameters(static_cast<Tree::Parameter>(k), numbers);
+  valid_parts_ = 0, basis_configuration_ = -1, ++configuration_count;
 }
 
-bool Core::reversed() {
-  if (rows.closure.rows != static_cast<int>(z.size()) || z.empty()) return false;
+bool Core::has_negative_determinant() {
+  if (constraints.closure.rows != static_cast<int>(z.size()) || z.empty()) return false;
   Matrix square(z.size(), z.size());
-  jacobian();
-  for (size_t k = 0; k < z.size(); ++k) square.col(k) = rows.J.col(z[k]);
+  compute_J();
+  for (size_t k = 0; k < z.size(); ++k) square.col(k) = constraints.J.col(z[k]);
   return square.partialPivLu().determinant() < 0.0;
 }
 
-void Core::set(In q_tree_, bool with_inertia) {
-  ++sets;
+void Core::set_configuration(In q_tree_, bool with_inertia) {
+  ++configuration_count;
   q_tree = q_tree_;
-  Profile::Entry entry(profile, with_inertia && !written ? Profile::D_tree : Profile::phi);
-  if (written) {
-    written->place(q_tree, rows.phi, rows.J);
-    here_ = jacobian_of_rows;
+  Profile::Entry entry(profile, with_inertia && !compiled ? Profile::D_tree : Profile::phi);
+  if (compiled) {
+    compiled->evaluate_closure(q_tree, constraints.phi, constraints.J);
+    valid_parts_ = jacobian_of_rows;
     return;
   }
   if (with_inertia)
-    tree.inertia(q_tree);
+    tree.compute_D(q_tree);
   else
-    tree.set(q_tree);
-  here_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
-  rows.set(tree, q_tree);
+    tree.set_configuration(q_tree);
+  valid_parts_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
+  constraints.update(tree, q_tree);
 }
 
 void Core::set_velocity(In v) {
   if (v_tree == v) return;
   v_tree = v;
-  here_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
+  valid_parts_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
 }
 
-// For what is not written out.
-void Core::set_tree() {
-  if (has(tree_is_set)) return;
-  tree.set(q_tree);
-  rows.set(tree, q_tree);
-  here_ |= tree_is_set;
+// Compute what the compiled terms do not provide.
+void Core::update_tree() {
+  if (is_valid(tree_is_set)) return;
+  tree.set_configuration(q_tree);
+  constraints.update(tree, q_tree);
+  valid_parts_ |= tree_is_set;
 }
 
-void Core::jacobian() {
-  if (has(jacobian_of_rows)) return;
+void Core::compute_J() {
+  if (is_valid(jacobian_of_rows)) return;
   Profile::Entry entry(profile, Profile::J);
-  rows.jacobian(tree);
-  here_ |= jacobian_of_rows;
+  constraints.update_jacobian(tree);
+  valid_parts_ |= jacobian_of_rows;
 }
 
-void Core::factor() {
-  if (has(factor_of_phi_z)) return;
-  jacobian();
+void Core::factorize_phi_z() {
+  if (is_valid(factor_of_phi_z)) return;
+  compute_J();
   Profile::Entry entry(profile, Profile::phi_z);
-  phi_z.compute(rows.J, z);
-  here_ |= factor_of_phi_z;
+  phi_z.compute(constraints.J, z);
+  valid_parts_ |= factor_of_phi_z;
 }
 
-void Core::reduce() {
-  if (has(rho_of_phi_z)) return;
-  factor();
+void Core::compute_rho() {
+  if (is_valid(rho_of_phi_z)) return;
+  factorize_phi_z();
   Profile::Entry entry(profile, Profile::rho);
   for (int k = 0; k < d; ++k) {
-    residual_ = -rows.J.col(q[k]);
+    residual_ = -constraints.J.col(q[k]);
     phi_z.solve(residual_, z_);
     for (int i = 0; i < d; ++i) rho(q[i], k) = 0.0;
     rho(q[k], k) = 1.0;
     for (size_t i = 0; i < z.size(); ++i) rho(z[i], k) = z_(i);
   }
-  here_ |= rho_of_phi_z;
+  valid_parts_ |= rho_of_phi_z;
 }
 
-void Core::tree_inertia() {
-  if (has(inertia_of_tree)) return;
+void Core::compute_D_tree() {
+  if (is_valid(inertia_of_tree)) return;
   Profile::Entry entry(profile, Profile::D_tree);
-  if (written)
-    written->inertia(q_tree, D_written_);
+  if (compiled)
+    compiled->evaluate_D_tree(q_tree, D_compiled_);
   else
-    tree.inertia(q_tree);
-  here_ |= inertia_of_tree;
+    tree.compute_D(q_tree);
+  valid_parts_ |= inertia_of_tree;
 }
 
-void Core::inertia() {
-  if (has(inertia_of_q)) return;
-  tree_inertia(), reduce();
+void Core::compute_D() {
+  if (is_valid(inertia_of_q)) return;
+  compute_D_tree(), compute_rho();
   Profile::Entry entry(profile, Profile::D);
-  if (dense_) {
+  if (D_tree_is_dense_) {
     D_rho_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * rho;
     D.noalias() = rho.transpose() * D_rho_;
   } else {
-    for (int k = 0; k < d; ++k) D_times(rho.col(k), D_rho_.col(k));
+    for (int k = 0; k < d; ++k) multiply_D_tree(rho.col(k), D_rho_.col(k));
     for (int i = 0; i < d; ++i)
       for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
   }
   D_factor.compute(D);
-  here_ |= inertia_of_q;
+  valid_parts_ |= inertia_of_q;
 }
 
-void Core::D_times(In x, Out product) const {
+void Core::multiply_D_tree(In x, Out product) const {
   const Matrix& D = D_tree();
   product.setZero();
   for (int j = 0; j < n; ++j) {
@@ -190,123 +194,123 @@ void Core::D_times(In x, Out product) const {
 }
 
 double Core::potential_energy() {
-  if (written) return written->potential_energy(q_tree);
-  spring_lengths();
+  if (compiled) return compiled->potential_energy(q_tree);
+  update_spring_lengths();
   return tree.potential_energy(q_tree) + springs.energy(tree, q_tree);
 }
 
 Energy Core::energy(In v, Out momentum) {
-  tree_inertia();
-  D_times(v, momentum);
+  compute_D_tree();
+  multiply_D_tree(v, momentum);
   return {0.5 * v.dot(momentum), potential_energy()};
 }
 
-void Core::velocity(In q_dot, Out v) const {
+void Core::multiply_rho(In q_dot, Out v) const {
   v.setZero();
   for (int k = 0; k < d; ++k) v += q_dot(k) * rho.col(k);
 }
 
-void Core::reduced(In force, Out generalized) const {
+void Core::multiply_rho_transposed(In force, Out generalized) const {
   for (int k = 0; k < d; ++k) generalized(k) = rho.col(k).dot(force);
 }
 
-// The tree's velocities, and from them the rows'.
-void Core::row_rates_of_tree() {
-  if (has(row_rates)) return;
-  set_tree();
-  bias_without_springs_ = tree.bias(q_tree, v_tree);
-  rows.rates(tree);
-  here_ |= row_rates;
+// Compute the velocities of the tree, and from them the rates of the constraint rows.
+void Core::update_row_rates() {
+  if (is_valid(row_rates)) return;
+  update_tree();
+  bias_without_springs_ = tree.compute_bias(q_tree, v_tree);
+  constraints.update_rates(tree);
+  valid_parts_ |= row_rates;
 }
 
-void Core::jacobian_rate(In v) {
-  if (written) return written->jacobian_rate(q_tree, v, rows.J_dot);
+void Core::compute_J_dot(In v) {
+  if (compiled) return compiled->evaluate_J_dot(q_tree, v, constraints.J_dot);
   set_velocity(v);
-  row_rates_of_tree();
-  rows.jacobian_dot(tree, tree.jacobian_rate(q_tree, v_tree));
+  update_row_rates();
+  constraints.update_jacobian_dot(tree, tree.compute_jacobian_dot(q_tree, v_tree));
 }
 
-// A step x beside v' does not commute with it where axes turn along.
-void Core::closure_rate(In v, Matrix& by_q) {
-  jacobian_rate(v);
-  by_q = rows.J_dot;
-  if (!tree.roots.empty()) jacobian(), by_q.noalias() -= rows.J * tree.brackets(v);
+// With free roots, tangent steps do not commute with v', which adds J bracket_matrix(v).
+void Core::constraint_rate_derivative(In v, Matrix& by_q) {
+  compute_J_dot(v);
+  by_q = constraints.J_dot;
+  if (!tree.roots.empty()) compute_J(), by_q.noalias() -= constraints.J * tree.bracket_matrix(v);
 }
 
-void Core::bias() {
-  if (has(bias_of_tree)) return;
+void Core::compute_bias() {
+  if (is_valid(bias_of_tree)) return;
   Profile::Entry entry(profile, Profile::bias_tree);
-  here_ |= bias_of_tree;
-  if (written) return written->bias(q_tree, v_tree, bias_tree, J_dot_v, damping_tree);
-  row_rates_of_tree();
-  rows.bias(J_dot_v);
+  valid_parts_ |= bias_of_tree;
+  if (compiled) return compiled->evaluate_bias(q_tree, v_tree, bias_tree, J_dot_v, damping_tree);
+  update_row_rates();
+  constraints.bias(J_dot_v);
   bias_tree = bias_without_springs_;
-  if (springs.any) spring_forces(), bias_tree -= elastic_;
-  if (!springs.any_damping) return;
-  spring_lengths(), damping_tree.setZero();
-  springs.add_damping(v_tree, damping_tree);
+  if (springs.has_elastic_forces) compute_spring_forces(), bias_tree -= elastic_;
+  if (!springs.has_damping) return;
+  update_spring_lengths(), damping_tree.setZero();
+  springs.add_damping_force(v_tree, damping_tree);
 }
 
-void Core::spring_forces() {
-  spring_lengths(), elastic_.setZero();
-  springs.add_elastic(tree, q_tree, elastic_);
+void Core::compute_spring_forces() {
+  update_spring_lengths(), elastic_.setZero();
+  springs.add_elastic_force(tree, q_tree, elastic_);
 }
 
-void Core::spring_lengths() {
-  if (has(lengths_of_springs)) return;
-  set_tree();
-  if (springs.any || springs.any_damping) springs.set(tree);
-  here_ |= lengths_of_springs;
+void Core::update_spring_lengths() {
+  if (is_valid(lengths_of_springs)) return;
+  update_tree();
+  if (springs.has_elastic_forces || springs.has_damping) springs.update_lengths(tree);
+  valid_parts_ |= lengths_of_springs;
 }
 
-void Core::coriolis() {
-  if (has(coriolis_of_tree)) return;
+void Core::compute_coriolis() {
+  if (is_valid(coriolis_of_tree)) return;
   Profile::Entry entry(profile, Profile::C_tree);
-  here_ |= coriolis_of_tree;
-  if (written && written->has_coriolis()) {
-    jacobian_rate(v_tree);
-    return written->rest(q_tree, h_tree);
+  valid_parts_ |= coriolis_of_tree;
+  if (compiled && compiled->has_coriolis()) {
+    compute_J_dot(v_tree);
+    return compiled->evaluate_h_tree(q_tree, h_tree);
   }
-  row_rates_of_tree();
-  C_tree_ = tree.coriolis(q_tree, v_tree);
-  rows.jacobian_dot(tree, tree.jacobian_dot());
-  h_tree = tree.gravity(q_tree);
-  if (springs.any) spring_forces(), h_tree -= elastic_;
+  update_row_rates();
+  C_tree_ = tree.compute_coriolis(q_tree, v_tree);
+  constraints.update_jacobian_dot(tree, tree.jacobian_dot());
+  h_tree = tree.compute_gravity(q_tree);
+  if (springs.has_elastic_forces) compute_spring_forces(), h_tree -= elastic_;
 }
 
-void Core::C_tree_times(In x, Out product) {
-  if (written && written->has_coriolis())
-    written->coriolis(q_tree, v_tree, x, product);
+void Core::multiply_C_tree(In x, Out product) {
+  if (compiled && compiled->has_coriolis())
+    compiled->multiply_C_tree(q_tree, v_tree, x, product);
   else
     product.noalias() = C_tree_ * x;
 }
 
-void Core::rho_dot_times(In x, Out product) {
-  velocity(x, moved_);
-  residual_.noalias() = -rows.J_dot * moved_;
+void Core::multiply_rho_dot(In x, Out product) {
+  multiply_rho(x, rho_times_x_);
+  residual_.noalias() = -constraints.J_dot * rho_times_x_;
   phi_z.solve(residual_, z_);
   product.setZero();
   for (size_t i = 0; i < z.size(); ++i) product(z[i]) = z_(i);
 }
 
-void Core::C_times(In x, Out product) {
-  rho_dot_times(x, x_);
-  D_times(x_, y_);
-  velocity(x, x_);
-  C_tree_times(x_, moved_);
-  y_ += moved_;
-  reduced(y_, product);
+void Core::multiply_C(In x, Out product) {
+  multiply_rho_dot(x, x_);
+  multiply_D_tree(x_, y_);
+  multiply_rho(x, x_);
+  multiply_C_tree(x_, rho_times_x_);
+  y_ += rho_times_x_;
+  multiply_rho_transposed(y_, product);
 }
 
 void Core::reduced_acceleration(In u_tree, Out q_ddot) {
-  inertia(), bias();
+  compute_D(), compute_bias();
   residual_ = -J_dot_v;
-  phi_z.solve(residual_, z_);  // J rho = 0 differentiated
+  phi_z.solve(residual_, z_);  // from J rho = 0, differentiated
   rho_dot_q_dot_.setZero();
   for (size_t i = 0; i < z.size(); ++i) rho_dot_q_dot_(z[i]) = z_(i);
-  D_times(rho_dot_q_dot_, y_);
+  multiply_D_tree(rho_dot_q_dot_, y_);
   x_ = u_tree - bias_tree - y_ + damping_tree;
-  reduced(x_, d_);
+  multiply_rho_transposed(x_, d_);
   D_factor.solve(d_, q_ddot);
 }
 
@@ -316,8 +320,8 @@ void Core::tree_acceleration(In q_ddot, Out a) const {
 }
 
 void Core::actual_acceleration(In u_tree, In q_dot, Out q_ddot) {
-  inertia(), bias(), coriolis();
-  C_times(q_dot, d_);
+  compute_D(), compute_bias(), compute_coriolis();
+  multiply_C(q_dot, d_);
   x_ = u_tree - h_tree + damping_tree;
   for (int k = 0; k < d; ++k) d_(k) = rho.col(k).dot(x_) - d_(k);
   D_factor.solve(d_, q_ddot);

@@ -1,9 +1,10 @@
-// Eq. 1 where masses are very unequal.
+// Acceleration of eq. 1 for mechanisms with very unequal masses.
 //
-// T^T D' T adds what heavy and light bodies bring to each pair of directions. Directions along which only light bodies move are
-// then known to the rounding of the heavy ones: with masses of a ratio 1e9 and a heavy load at the end of a chain, to seven
-// digits. Here directions are sorted by what they move: the first ones move the heaviest bodies, all others leave these where
-// they are, and so on. To an entry of D' of two directions only those bodies contribute that both may move.
+// T^T D' T adds the contributions of heavy and light bodies for each pair of directions. Directions that move light
+// bodies only are then known to the rounding of the heavy ones: to seven digits if masses differ by 1e9 and a heavy
+// load is at the end of a chain. Here the directions are sorted into levels. Directions of the first level move the
+// heaviest bodies, all others leave these at rest, and so on. Only bodies that both directions of a pair move then
+// contribute to its entry of D'.
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -14,112 +15,116 @@
 
 namespace ckc {
 
-constexpr double spread = 1e5;        // ratio of masses from which rounding is looked at
-constexpr double gap = 1e3;           // ratio of weights within a level
-constexpr double unmoved = 1e-13;     // relative to what moves most in a level: rounding
+constexpr double min_mass_ratio = 1e5;      // ratio of masses from which rounding is checked
+constexpr double max_level_ratio = 1e3;     // ratio of inertias within a level
+constexpr double motion_tolerance = 1e-13;  // relative to the largest motion in a level; below it is rounding
 
 bool Core::has_uneven_masses() const {
-  double least = std::numeric_limits<double>::infinity(), most = 0.0;
+  double lightest = std::numeric_limits<double>::infinity(), heaviest = 0.0;
   for (int joint = 1; joint < tree.joints; ++joint) {
     const double mass = tree.body(joint).mass;
-    if (mass > 0.0) least = std::min(least, mass), most = std::max(most, mass);
+    if (mass > 0.0) lightest = std::min(lightest, mass), heaviest = std::max(heaviest, mass);
   }
-  return most > spread * least && n > rank;
+  return heaviest > min_mass_ratio * lightest && n > rank;
 }
 
-// Bodies as six components each, of the centre's velocity and of the angular velocity along the principal axes: `moved` is by how
-// much each tangent direction moves one, `rate` what its acceleration is without them, gravity taken off, `load` the moment that
-// its rotation takes. `size` is the inertia that it brings to directions, of three components alike: one that no direction moves
-// here, though it is heavy, is not a light one.
+// Six velocity components per body: of the centre of mass, and of the angular velocity along the principal axes.
+// `motion` is the component per tangent direction, `rate` its acceleration without them and without gravity, `load`
+// the gyroscopic moment. `size` is the inertia that the component contributes. All three components of a kind share
+// it, so a heavy body that no direction moves along one axis does not count as light.
 struct Core::Components {
   std::vector<double> weight, rate, load, size;
-  std::vector<Vector> moved;
+  std::vector<Vector> motion;
 };
 
-void Core::components(Components& of) {
-  set_tree();
-  tree.bias(q_tree, v_tree);
+void Core::body_velocity_components(Components& of) {
+  update_tree();
+  tree.compute_bias(q_tree, v_tree);
   Vector units(n - rank);
-  for (int k = 0; k < n - rank; ++k) units(k) = scales.columns(free_[k]);
-  const Vector3 gravity = tree.field().head<3>();
-  Eigen::Matrix<double, 3, Eigen::Dynamic> along(3, n);
+  for (int k = 0; k < n - rank; ++k) units(k) = scales.columns(basis_coordinates_[k]);
+  const Vector3 gravity = tree.spatial_gravity().head<3>();
+  Eigen::Matrix<double, 3, Eigen::Dynamic> velocity_by_direction(3, n);
   const auto add = [&](const Vector3& weight, const Vector3& rate, const Vector3& load) {
-    const Matrix moved = along * tangent_;
-    const Vector3 rates = rate + along * x_;
-    const double most = (moved * units.asDiagonal()).cwiseAbs().maxCoeff();
+    const Matrix motion = velocity_by_direction * tangent_;
+    const Vector3 rates = rate + velocity_by_direction * x_;
+    const double heaviest = (motion * units.asDiagonal()).cwiseAbs().maxCoeff();
     for (int axis = 0; axis < 3; ++axis) {
-      if (!(weight(axis) * most * most > 0.0)) continue;
+      if (!(weight(axis) * heaviest * heaviest > 0.0)) continue;
       of.weight.push_back(weight(axis)), of.rate.push_back(rates(axis)), of.load.push_back(load(axis));
-      of.size.push_back(weight(axis) * most * most), of.moved.push_back(moved.row(axis).transpose());
+      of.size.push_back(weight(axis) * heaviest * heaviest), of.motion.push_back(motion.row(axis).transpose());
     }
   };
   for (int joint = 1; joint < tree.joints; ++joint) {
     const Tree::Body body = tree.body(joint);
     if (!(body.mass > 0.0)) continue;
-    const Vector6 twist = tree.velocity(joint), rate = tree.acceleration(joint);
-    const Vector3 turn = twist.tail<3>(), speed = twist.head<3>() + turn.cross(body.centre);
-    const Vector3 pull = rate.head<3>() + rate.tail<3>().cross(body.centre) + turn.cross(speed) - gravity;
-    along.setZero();
+    const Vector6 twist = tree.velocity(joint), rate = tree.bias_acceleration(joint);
+    const Vector3 omega = twist.tail<3>(), speed = twist.head<3>() + omega.cross(body.centre);
+    const Vector3 acceleration = rate.head<3>() + rate.tail<3>().cross(body.centre) + omega.cross(speed) - gravity;
+    velocity_by_direction.setZero();
     for (int k : tree.support[joint]) {
       const Vector6 direction = tree.jacobian().col(k);
-      along.col(k) = direction.head<3>() + direction.tail<3>().cross(body.centre);
+      velocity_by_direction.col(k) = direction.head<3>() + direction.tail<3>().cross(body.centre);
     }
-    add(Vector3::Constant(body.mass), pull, Vector3::Zero());
+    add(Vector3::Constant(body.mass), acceleration, Vector3::Zero());
     const Eigen::SelfAdjointEigenSolver<Matrix3> principal(body.inertia);
     const Matrix3 axes = principal.eigenvectors().transpose();
-    along.setZero();
-    for (int k : tree.support[joint]) along.col(k) = axes * tree.jacobian().col(k).tail<3>();
-    add(principal.eigenvalues(), axes * rate.tail<3>(), axes * turn.cross(Vector3(body.inertia * turn)));
+    velocity_by_direction.setZero();
+    for (int k : tree.support[joint]) velocity_by_direction.col(k) = axes * tree.jacobian().col(k).tail<3>();
+    add(principal.eigenvalues(), axes * rate.tail<3>(), axes * omega.cross(Vector3(body.inertia * omega)));
   }
 }
 
-bool Core::project_by_levels(In u_tree, Out a) {
+bool Core::project_by_mass_levels(In u_tree, Out a) {
   Components of;
-  components(of);
+  body_velocity_components(of);
   const int d_ = n - rank, count = static_cast<int>(of.weight.size());
   Indices order(count), level(count);
   std::iota(order.begin(), order.end(), 0);
   std::stable_sort(order.begin(), order.end(), [&](int i, int k) { return of.size[i] > of.size[k]; });
-  Matrix basis(d_, d_), left = Matrix::Identity(d_, d_);
+  Matrix basis(d_, d_), remaining = Matrix::Identity(d_, d_);
   Indices level_of;  // by column of the basis
   int levels = 0;
   for (int first = 0, last; first < count; first = last, ++levels) {
-    for (last = first; last < count && of.size[order[last]] * gap >= of.size[order[first]]; ++last) level[order[last]] = levels;
-    const auto free = left.cols();
+    for (last = first; last < count && of.size[order[last]] * max_level_ratio >= of.size[order[first]]; ++last)
+      level[order[last]] = levels;
+    const auto free = remaining.cols();
     if (!free) continue;
-    Matrix seen(free, last - first);
+    Matrix weighted_motion(free, last - first);
     for (int k = first; k < last; ++k)
-      seen.col(k - first).noalias() = std::sqrt(of.weight[order[k]]) * (left.transpose() * of.moved[order[k]]);
-    const Eigen::ColPivHouseholderQR<Matrix> qr(seen);
+      weighted_motion.col(k - first).noalias() =
+          std::sqrt(of.weight[order[k]]) * (remaining.transpose() * of.motion[order[k]]);
+    const Eigen::ColPivHouseholderQR<Matrix> qr(weighted_motion);
     const auto pivots = qr.matrixQR().diagonal().cwiseAbs();
     const double largest = std::sqrt(of.size[order[first]]);
-    Eigen::Index found = 0;
-    while (found < pivots.size() && pivots(found) > unmoved * largest) ++found;
-    const Matrix turned = left * Matrix(qr.householderQ());
-    basis.middleCols(d_ - free, found) = turned.leftCols(found);
-    level_of.resize(level_of.size() + static_cast<size_t>(found), levels);
-    left = turned.rightCols(free - found);
+    Eigen::Index motion_rank = 0;
+    while (motion_rank < pivots.size() && pivots(motion_rank) > motion_tolerance * largest) ++motion_rank;
+    const Matrix rotated = remaining * Matrix(qr.householderQ());
+    basis.middleCols(d_ - free, motion_rank) = rotated.leftCols(motion_rank);
+    level_of.resize(level_of.size() + static_cast<size_t>(motion_rank), levels);
+    remaining = rotated.rightCols(free - motion_rank);
   }
-  if (left.cols()) return false;  // what moves no mass
-  Matrix moved(count, d_), D_levels(d_, d_);
-  for (int r = 0; r < count; ++r) moved.row(r).noalias() = of.moved[r].transpose() * basis;
+  if (remaining.cols()) return false;  // some direction moves no mass
+  Matrix motion(count, d_), D_levels(d_, d_);
+  for (int r = 0; r < count; ++r) motion.row(r).noalias() = of.motion[r].transpose() * basis;
   const Matrix directions = tangent_ * basis;
-  if (springs.any) spring_forces();
-  else elastic_.setZero();
+  if (springs.has_elastic_forces)
+    compute_spring_forces();
+  else
+    elastic_.setZero();
   y_ = u_tree + elastic_ + damping_tree - tree.armature().cwiseProduct(x_);
   Vector force = directions.transpose() * y_;
   D_levels.noalias() = directions.transpose() * tree.armature().asDiagonal() * directions;
   for (int i = 0; i < d_; ++i)
     for (int r = 0; r < count; ++r) {
       if (level[r] < level_of[i]) continue;
-      force(i) -= (of.weight[r] * of.rate[r] + of.load[r]) * moved(r, i);
-      for (int k = 0; k <= i; ++k) D_levels(i, k) += of.weight[r] * moved(r, i) * moved(r, k);
+      force(i) -= (of.weight[r] * of.rate[r] + of.load[r]) * motion(r, i);
+      for (int k = 0; k <= i; ++k) D_levels(i, k) += of.weight[r] * motion(r, i) * motion(r, k);
     }
   const Vector scale = D_levels.diagonal().cwiseSqrt().cwiseInverse();
   const Matrix scaled = scale.asDiagonal() * D_levels * scale.asDiagonal();
-  const Eigen::LLT<Matrix> factor(scaled);
-  if (factor.info() != Eigen::Success) return false;
-  force = scale.cwiseProduct(factor.solve(scale.cwiseProduct(force)));
+  const Eigen::LLT<Matrix> factorization(scaled);
+  if (factorization.info() != Eigen::Success) return false;
+  force = scale.cwiseProduct(factorization.solve(scale.cwiseProduct(force)));
   a = x_ + directions * force;
   return finite(a);
 }

@@ -1,4 +1,4 @@
-// The tangent space of the closure: eq. 1's acceleration by projection on it, and steps that close the loops.
+// The tangent space of the constraint manifold: projection of eq. 1 on it, and steps towards the manifold.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -9,72 +9,76 @@
 
 namespace ckc {
 
-// Relative size of the last pivot of J at which its rank counts as lost; and below which the metric of D' is given up.
-constexpr double singular = 1e-12, weak = 1e-3;
-// Of phi_z's pivots, and of rho: where the tangent basis' partition is as good as any. A new one has to be better.
-constexpr double sound = 1e-2, steep = 4.0, better = 3.0;
-// Of the forces: what rounding makes of them on the way to an acceleration.
-constexpr double acceleration_digits = 1e-13;
+// Relative sizes of the last pivot of J: below the first its rank is lost, below the second the metric of D' is not
+// used.
+constexpr double rank_lost_pivot = 1e-12, min_pivot_for_inertia_metric = 1e-3;
+// The partition of the tangent basis is kept while its pivots are larger and its entries smaller than these. A new
+// partition must satisfy the stricter last bound.
+constexpr double min_partition_pivot = 1e-2, max_partition_slope = 4.0, max_new_partition_slope = 3.0;
+// Rounding error of an acceleration, relative to the forces that cause it.
+constexpr double acceleration_rounding_factor = 1e-13;
 
-// tangent_ and x_ of a partition whose z follow its q closely, J being far from a loss of rank.
-bool Core::basis_by_partition() {
-  if (basis_at_ != sets) {
-    basis_at_ = -1;
-    basis_.compute(rows.J, basis_z_);
-    free_ = basis_q_;
-    if (!(basis_.pivot_ratio() > sound)) return false;
+// Compute tangent_ and x_ from the present partition. Fails near a loss of rank or if z moves much faster than q.
+bool Core::find_basis_by_partition() {
+  if (basis_configuration_ != configuration_count) {
+    basis_configuration_ = -1;
+    basis_.compute(constraints.J, basis_z_);
+    basis_coordinates_ = basis_q_;
+    if (!(basis_.pivot_ratio() > min_partition_pivot)) return false;
     for (int k = 0; k < n - rank; ++k) {
-      residual_ = -rows.J.col(basis_q_[k]);
+      residual_ = -constraints.J.col(basis_q_[k]);
       basis_.solve(residual_, z_);
       tangent_.col(k).setZero();
       tangent_(basis_q_[k], k) = 1.0;
       for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
     }
-    if (!(steepness() < steep)) return false;
-    basis_at_ = sets;
+    if (!(largest_basis_entry() < max_partition_slope)) return false;
+    basis_configuration_ = configuration_count;
   }
-  basis_.solve(negative_, z_);
+  basis_.solve(minus_residual_, z_);
   for (size_t i = 0; i < basis_z_.size(); ++i) x_(basis_z_[i]) = z_(i);
   return true;
 }
 
-// The largest entry of the tangent basis, free of units: each column has a one.
-double Core::steepness() const {
+// Largest dimensionless entry of the tangent basis. Each column contains a one.
+double Core::largest_basis_entry() const {
   double largest = 0.0;
   for (int k = 0; k < n - rank; ++k)
     for (int i = 0; i < n; ++i)
-      largest = std::max(largest, std::abs(tangent_(i, k)) / scales.columns(i) * scales.columns(free_[k]));
+      largest = std::max(largest, std::abs(tangent_(i, k)) / scales.columns(i) * scales.columns(basis_coordinates_[k]));
   return largest;
 }
 
-// Take the pivoting's columns for the tangent basis from now on, if they are other ones and good for a while.
-void Core::repartition() {
-  if (!(steepness() < better)) return;
+// Use the coordinates that pivoting has chosen for the tangent basis from now on, if they differ and are well
+// conditioned.
+void Core::take_pivots_as_partition() {
+  if (!(largest_basis_entry() < max_new_partition_slope)) return;
   const auto& order = qr_.colsPermutation().indices();
   pivots_.assign(order.data(), order.data() + rank);
   std::sort(pivots_.begin(), pivots_.end());
   if (pivots_ == basis_z_) return;
   basis_z_ = pivots_;
   basis_q_.assign(order.data() + rank, order.data() + n);
-  basis_.shape(rows.closure.rows, rank, rows.pattern_of(basis_z_, n));
+  basis_.shape(constraints.closure.rows, rank, constraints.pattern_in(basis_z_, n));
 }
 
-// J P = Q [R S], and the columns that the pivoting left over are the freedoms; slides in units of the mechanism's size.
-bool Core::basis_by_pivoting(double least) {
-  qr_.compute(rows.J * scales.columns.asDiagonal());
+// J P = Q [R S]. The columns that pivoting leaves over are the freedoms. Lengths are measured in the mechanism's
+// size.
+bool Core::find_basis_by_pivoting(double min_pivot) {
+  qr_.compute(constraints.J * scales.columns.asDiagonal());
   const auto& r = qr_.matrixQR();
   const auto& order = qr_.colsPermutation().indices();
-  if (rank && !(std::abs(r(rank - 1, rank - 1)) > least * std::abs(r(0, 0)))) return false;
-  turned_ = negative_;
-  for (int k = 0; k < rank; ++k) {  // Q^T
-    const auto v = r.col(k).tail(turned_.size() - k - 1);
-    const double along = qr_.hCoeffs()(k) * (turned_(k) + v.dot(turned_.tail(v.size())));
-    turned_(k) -= along;
-    turned_.tail(v.size()) -= along * v;
+  if (rank && !(std::abs(r(rank - 1, rank - 1)) > min_pivot * std::abs(r(0, 0)))) return false;
+  householder_rhs_ = minus_residual_;
+  for (int k = 0; k < rank; ++k) {  // apply Q^T
+    const auto v = r.col(k).tail(householder_rhs_.size() - k - 1);
+    const double projection = qr_.hCoeffs()(k) * (householder_rhs_(k) + v.dot(householder_rhs_.tail(v.size())));
+    householder_rhs_(k) -= projection;
+    householder_rhs_.tail(v.size()) -= projection * v;
   }
   tangent_.setZero();
-  for (int i = rank - 1; i >= 0; --i) {  // -R^-1 of it and of S, by rows
-    double value = turned_(i);
+  for (int i = rank - 1; i >= 0; --i) {  // back substitution: -R^-1 of the right-hand side and of S
+    double value = householder_rhs_(i);
     for (int k = i + 1; k < rank; ++k) value -= r(i, k) * x_(order(k));
     x_(order(i)) = value / r(i, i);
     for (int j = 0; j < n - rank; ++j) {
@@ -83,277 +87,288 @@ bool Core::basis_by_pivoting(double least) {
       tangent_(order(i), j) = entry / r(i, i);
     }
   }
-  for (int j = 0; j < n - rank; ++j) tangent_(free_[j] = order(rank + j), j) = 1.0;
+  for (int j = 0; j < n - rank; ++j) tangent_(basis_coordinates_[j] = order(rank + j), j) = 1.0;
   x_.array() *= scales.columns.array();
-  for (int j = 0; j < n - rank; ++j) tangent_.col(j).array() *= scales.columns.array() / scales.columns(free_[j]);
+  for (int j = 0; j < n - rank; ++j)
+    tangent_.col(j).array() *= scales.columns.array() / scales.columns(basis_coordinates_[j]);
   return true;
 }
 
-bool Core::tangent_basis(In residual, double least) {
-  jacobian();
+bool Core::find_tangent_basis(In residual, double min_pivot) {
+  compute_J();
   x_.setZero();
-  negative_ = -residual;  // which may be residual_
-  if (!rows.closure.rows)
+  minus_residual_ = -residual;  // residual may be residual_ itself
+  if (!constraints.closure.rows)
     tangent_.setIdentity();
-  else if (!basis_by_partition()) {
-    if (!basis_by_pivoting(least)) return false;
-    repartition();
+  else if (!find_basis_by_partition()) {
+    if (!find_basis_by_pivoting(min_pivot)) return false;
+    take_pivots_as_partition();
   }
   return true;
 }
 
-void Core::tangent_inertia() {
-  if (inertia_at_ == sets && basis_at_ == sets) return;
-  tree_inertia();
-  if (dense_)
+void Core::factorize_tangent_inertia() {
+  if (inertia_configuration_ == configuration_count && basis_configuration_ == configuration_count) return;
+  compute_D_tree();
+  if (D_tree_is_dense_)
     D_tangent_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * tangent_;
   else
-    for (int k = 0; k < n - rank; ++k) D_times(tangent_.col(k), D_tangent_.col(k));
-  square_.noalias() = tangent_.transpose() * D_tangent_;
-  square_factor_.compute(square_);
-  inertia_at_ = basis_at_;
+    for (int k = 0; k < n - rank; ++k) multiply_D_tree(tangent_.col(k), D_tangent_.col(k));
+  tangent_matrix_.noalias() = tangent_.transpose() * D_tangent_;
+  tangent_factor_.compute(tangent_matrix_);
+  inertia_configuration_ = basis_configuration_;
 }
 
-void Core::with_force(In force, Out x) {
-  small_b_.noalias() = tangent_.transpose() * force;
-  square_factor_.solve(small_b_, small_);
+void Core::add_force_response(In force, Out x) {
+  tangent_rhs_.noalias() = tangent_.transpose() * force;
+  tangent_factor_.solve(tangent_rhs_, tangent_solution_);
   x = x_;
-  for (int k = 0; k < n - rank; ++k) x += small_(k) * tangent_.col(k);
+  for (int k = 0; k < n - rank; ++k) x += tangent_solution_(k) * tangent_.col(k);
 }
 
-void Core::z_step(In residual, Out x) {
+void Core::closure_step_in_z(In residual, Out x) {
   phi_z.solve(residual, z_);
   x.setZero();
   for (size_t k = 0; k < z.size(); ++k) x(z[k]) = -z_(k);
 }
 
-bool Core::step_onto_closure(In residual, Out x) {
-  return (written && written->closing_step(q_tree, residual, x)) || shortest_step(residual, x);
+bool Core::cheapest_closure_step(In residual, Out x) {
+  return (compiled && compiled->closure_step(q_tree, residual, x)) || minimum_norm_closure_step(residual, x);
 }
 
-bool Core::closing_step(In residual, Out x) {
-  if (written && written->closing_step(q_tree, residual, x)) return true;
-  if (!tangent_basis(residual, weak)) return shortest_step(residual, x);
-  tangent_inertia();
-  D_times(x_, y_);
+bool Core::closure_step(In residual, Out x) {
+  if (compiled && compiled->closure_step(q_tree, residual, x)) return true;
+  if (!find_tangent_basis(residual, min_pivot_for_inertia_metric)) return minimum_norm_closure_step(residual, x);
+  factorize_tangent_inertia();
+  multiply_D_tree(x_, y_);
   y_ = -y_;
-  with_force(y_, x);
+  add_force_response(y_, x);
   return true;
 }
 
-bool Core::shortest_step(In residual, Out x) {
-  if (!tangent_basis(residual, singular)) return false;
-  square_.noalias() = tangent_.transpose() * tangent_;
-  square_factor_.compute(square_), inertia_at_ = -1;
+bool Core::minimum_norm_closure_step(In residual, Out x) {
+  if (!find_tangent_basis(residual, rank_lost_pivot)) return false;
+  tangent_matrix_.noalias() = tangent_.transpose() * tangent_;
+  tangent_factor_.compute(tangent_matrix_), inertia_configuration_ = -1;
   y_ = -x_;
-  with_force(y_, x);
+  add_force_response(y_, x);
   return true;
 }
 
-const Matrix* Core::tangent() {
+const Matrix* Core::compute_tangent_basis() {
   residual_.setZero();
-  return tangent_basis(residual_, singular) ? &tangent_ : nullptr;
+  return find_tangent_basis(residual_, rank_lost_pivot) ? &tangent_ : nullptr;
 }
 
-void Core::particular(In residual, Out x) {
-  tangent_basis(residual, singular);
+void Core::particular_solution(In residual, Out x) {
+  find_tangent_basis(residual, rank_lost_pivot);
   x = x_;
 }
 
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
-  if (written_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
-  bias();
+  if (compiled_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
+  compute_bias();
   residual_ = J_dot_v + correction;
-  if (!tangent_basis(residual_, singular)) return false;
-  if (!uses_levels_ || !project_by_levels(u_tree, acceleration)) project(u_tree, acceleration);
+  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
+  if (!uses_mass_levels_ || !project_by_mass_levels(u_tree, acceleration))
+    project_on_tangent_space(u_tree, acceleration);
   return true;
 }
 
-void Core::project(In u_tree, Out a) {
-  tangent_inertia();
-  D_times(x_, y_);
+void Core::project_on_tangent_space(In u_tree, Out a) {
+  factorize_tangent_inertia();
+  multiply_D_tree(x_, y_);
   y_ = u_tree - bias_tree - y_ + damping_tree;
-  with_force(y_, a);
+  add_force_response(y_, a);
 }
 
-bool Core::basis_for_check() {
-  jacobian(), bias();
-  negative_ = -J_dot_v, x_.setZero();
-  basis_at_ = -1;  // the partition's basis is computed again when it is needed
-  if (rows.closure.rows) return basis_by_pivoting(singular);
+bool Core::find_basis_for_check() {
+  compute_J(), compute_bias();
+  minus_residual_ = -J_dot_v, x_.setZero();
+  basis_configuration_ = -1;  // compute the partition's basis again when it is needed
+  if (constraints.closure.rows) return find_basis_by_pivoting(rank_lost_pivot);
   tangent_.setIdentity();
-  std::iota(free_.begin(), free_.end(), 0);
+  std::iota(basis_coordinates_.begin(), basis_coordinates_.end(), 0);
   return true;
 }
 
-// Relative to what the forces would give where none cancels another one: near an equilibrium accelerations are rounding.
-double Core::off(In a, In right) {
+// The scale is the acceleration that the forces would cause without cancellation: near an equilibrium the
+// accelerations themselves are rounding.
+double Core::relative_difference(In a, In reference) {
   const Vector& units = scales.columns;
-  double largest = right.cwiseQuotient(units).lpNorm<Eigen::Infinity>();
+  double largest = reference.cwiseQuotient(units).lpNorm<Eigen::Infinity>();
   for (int k = 0; k < n - rank; ++k) {
-    const auto along = tangent_.col(k);
-    const double inertia = along.cwiseAbs2().dot(D_tree().diagonal());
-    const double alone = inertia > 0.0 ? along.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
-    largest = std::max(largest, alone * along.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
+    const auto direction = tangent_.col(k);
+    const double inertia = direction.cwiseAbs2().dot(D_tree().diagonal());
+    const double alone = inertia > 0.0 ? direction.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
+    largest = std::max(largest, alone * direction.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
   }
-  const double difference = (a - right).cwiseQuotient(units).lpNorm<Eigen::Infinity>();
+  const double difference = (a - reference).cwiseQuotient(units).lpNorm<Eigen::Infinity>();
   if (!std::isfinite(difference)) return std::numeric_limits<double>::infinity();
   return difference > 0.0 ? difference / largest : 0.0;
 }
 
 double Core::rounding_of_elimination(In u_tree) {
-  Vector compiled(n), right(n);
+  Vector by_elimination(n), reference(n);
   residual_.setZero();
-  if (!written->eliminate(q_tree, v_tree, u_tree, residual_, compiled) || !basis_for_check()) return 0.0;
-  project(u_tree, right);
-  if (!uses_levels_) return off(compiled, right);
+  if (!compiled->eliminate(q_tree, v_tree, u_tree, residual_, by_elimination) || !find_basis_for_check()) return 0.0;
+  project_on_tangent_space(u_tree, reference);
+  if (!uses_mass_levels_) return relative_difference(by_elimination, reference);
   Vector by_levels(n);
   const Vector forces = y_;
-  if (project_by_levels(u_tree, by_levels)) right = by_levels;
+  if (project_by_mass_levels(u_tree, by_levels)) reference = by_levels;
   y_ = forces;
-  return off(compiled, right);
+  return relative_difference(by_elimination, reference);
 }
 
 double Core::rounding_of_projection(In u_tree) {
-  Vector plain(n), right(n);
-  if (!basis_for_check()) return 0.0;
-  project(u_tree, plain);
+  Vector by_projection(n), reference(n);
+  if (!find_basis_for_check()) return 0.0;
+  project_on_tangent_space(u_tree, by_projection);
   const Vector forces = y_;
-  if (!project_by_levels(u_tree, right)) return 0.0;
+  if (!project_by_mass_levels(u_tree, reference)) return 0.0;
   y_ = forces;
-  return off(plain, right);
+  return relative_difference(by_projection, reference);
 }
 
-bool Core::eq_1(In force, In correction, Out a) {
+bool Core::acceleration_with_held_joints(In force, In correction, Out a) {
   if (!dae_acceleration(force, correction, a)) return false;
   if (joints.locked.empty()) return true;
-  if (!responses(joints.locked, responses_)) return false;
+  if (!unit_force_responses(joints.locked, responses_)) return false;
   acceleration_rounding(joints.locked, responses_, force, a, rounding_);
-  joints.hold(responses_, a);
+  joints.add_holding_acceleration(responses_, a);
   return true;
 }
 
-// Generalized forces are rounded as the largest parts that cancel in them: those that would accelerate a joint's own
-// inertia as the fastest coordinate accelerates, as gravity does, or as the velocities turn the bodies.
+// Generalized forces are rounded relative to the largest parts that cancel in them. These are estimated as the force
+// that accelerates each joint's own inertia like the fastest coordinate, like gravity, or like the centripetal
+// accelerations.
 void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In force, In a, Vector& bound) {
   const Vector& reach = joints.table.reach;
-  const double fastest = v_tree.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
-  const double pace = std::max({a.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(), fastest * fastest,
-                                tree.field().head<3>().norm() / joints.table.size});
+  const double fastest_rate = v_tree.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+  const double acceleration_scale =
+      std::max({a.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(), fastest_rate * fastest_rate,
+                tree.spatial_gravity().head<3>().norm() / joints.table.size});
   const Matrix& D = D_tree();
-  effort_bound_ = force.cwiseAbs();
-  for (int k = 0; k < n; ++k) effort_bound_(k) += D(k, k) * reach(k) * pace;
-  bound.noalias() = columns.cwiseAbs().transpose() * effort_bound_;
-  bound *= acceleration_digits;
-  for (size_t i = 0; i < at.size(); ++i)  // a body that rests but for rounding turns at that rate
+  force_bound_ = force.cwiseAbs();
+  for (int k = 0; k < n; ++k) force_bound_(k) += D(k, k) * reach(k) * acceleration_scale;
+  bound.noalias() = columns.cwiseAbs().transpose() * force_bound_;
+  bound *= acceleration_rounding_factor;
+  for (size_t i = 0; i < at.size(); ++i)  // a body at rest still rotates at the rounding of its rate
     bound(static_cast<Eigen::Index>(i)) += reach(at[i]) * joints.rate_rounding * joints.rate_rounding;
-  bound *= joints.patience;
+  bound *= joints.rounding_factor;
 }
 
-bool Core::responses(const Indices& at, Matrix& columns) {
+bool Core::unit_force_responses(const Indices& at, Matrix& columns) {
   columns.resize(n, static_cast<Eigen::Index>(at.size()));
   residual_.setZero();
-  if (!tangent_basis(residual_, singular)) return false;
-  tangent_inertia();
+  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
+  factorize_tangent_inertia();
   for (size_t k = 0; k < at.size(); ++k) {
     y_.setUnit(at[k]);
-    with_force(y_, columns.col(k));
+    add_force_response(y_, columns.col(k));
   }
   return true;
 }
 
-void Core::multipliers(In force, Out lambda) {
-  if (!rows.closure.rows) return;
-  jacobian();
+void Core::minimum_norm_multipliers(In force, Out lambda) {
+  if (!constraints.closure.rows) return;
+  compute_J();
   transposed_.setThreshold(scales.rank);
-  transposed_.compute(scales.columns.asDiagonal() * rows.J.transpose() * scales.rows.asDiagonal());
+  transposed_.compute(scales.columns.asDiagonal() * constraints.J.transpose() * scales.rows.asDiagonal());
   lambda = scales.rows.cwiseProduct(transposed_.solve(scales.columns.cwiseProduct(force)));
 }
 
 bool Core::differentiate(In u_tree, In acceleration) {
-  bias(), tree_inertia();
-  D_times(acceleration, effort_);
-  effort_ += bias_tree - damping_tree - u_tree;
+  compute_bias(), compute_D_tree();
+  multiply_D_tree(acceleration, lacking_force_);
+  lacking_force_ += bias_tree - damping_tree - u_tree;
   lambda_.setZero();
-  multipliers(effort_, lambda_);
+  minimum_norm_multipliers(lacking_force_, lambda_);
   derivatives.compute(q_tree, v_tree, acceleration, lambda_);
   return derivatives.force_by_q.allFinite() && derivatives.row_by_q.allFinite();
 }
 
-bool Core::respond(const Matrix& force, const Matrix& residual, Matrix& change) {
+bool Core::solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& change) {
   change.resize(n, force.cols());
   for (Eigen::Index k = 0; k < force.cols(); ++k) {
     residual_ = residual.col(k);
-    if (!tangent_basis(residual_, singular)) return false;
-    if (!k) tangent_inertia();
-    D_times(x_, y_);
+    if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
+    if (!k) factorize_tangent_inertia();
+    multiply_D_tree(x_, y_);
     y_ = force.col(k) - y_;
-    with_force(y_, change.col(k));
+    add_force_response(y_, change.col(k));
   }
   return true;
 }
 
-bool Core::slopes(In q_at, In v, In correction, Vector& force, Matrix& u_by_q, Matrix& u_by_v, Vector& a, Matrix& by_q,
-                  Matrix& by_v, Matrix* by_u) {
-  joints.add_friction(v, force);
-  if (joints.smooth()) {
-    Vector slope = Vector::Zero(n);
-    joints.add_slopes(v, slope);
+bool Core::acceleration_derivatives(In q_at, In v, In correction, AppliedForce& applied,
+                                    AccelerationDerivatives& result, bool with_u) {
+  Vector& force = applied.value;
+  Matrix &u_by_q = applied.by_q, &u_by_v = applied.by_v;
+  Vector& a = result.a;
+  Matrix &by_q = result.by_q, &by_v = result.by_v, &by_u = result.by_u;
+  joints.add_friction_force(v, force);
+  if (joints.has_smooth_friction()) {
+    Vector friction_derivative = Vector::Zero(n);
+    joints.add_friction_derivative(v, friction_derivative);
     if (!u_by_v.size()) u_by_v.setZero(n, n);
-    u_by_v.diagonal() += slope;
+    u_by_v.diagonal() += friction_derivative;
   }
   a.resize(n);
   const bool locked = !joints.locked.empty();
   if (locked) {
     set_velocity(v);
-    if (!eq_1(force, correction, a)) return false;
-    for (size_t i = 0; i < joints.locked.size(); ++i) force(joints.locked[i]) += joints.forces()(static_cast<Eigen::Index>(i));
+    if (!acceleration_with_held_joints(force, correction, a)) return false;
+    for (size_t i = 0; i < joints.locked.size(); ++i)
+      force(joints.locked[i]) += joints.holding_forces()(static_cast<Eigen::Index>(i));
   }
-  Matrix& of_u = by_u ? *by_u : by_u_;
-  if (written && correction.isZero(0) && written->jacobian(q_at, v, force, by_state_, of_u)) {
+  if (compiled && correction.isZero(0) && compiled->evaluate_jacobian(q_at, v, force, by_state_, by_u)) {
     const int nq = tree.nq;
     by_v = by_state_.bottomRightCorner(n, n);
     if (nq == n) {
       by_q = by_state_.bottomLeftCorner(n, n);
     } else {
       by_q.resize(n, n);
-      Vector move(nq);
+      Vector q_rate(nq);
       for (int k = 0; k < n; ++k) {
-        tree.configuration_rate(q_at, Vector::Unit(n, k), move);
-        by_q.col(k).noalias() = by_state_.bottomLeftCorner(n, nq) * move;
+        tree.configuration_rate(q_at, Vector::Unit(n, k), q_rate);
+        by_q.col(k).noalias() = by_state_.bottomLeftCorner(n, nq) * q_rate;
       }
     }
-    if (u_by_q.size()) by_q.noalias() += of_u * u_by_q;
-    if (u_by_v.size()) by_v.noalias() += of_u * u_by_v;
+    if (u_by_q.size()) by_q.noalias() += by_u * u_by_q;
+    if (u_by_v.size()) by_v.noalias() += by_u * u_by_v;
   } else {
-    if (q_tree != q_at) set(q_at, true);
+    if (q_tree != q_at) set_configuration(q_at, true);
     set_velocity(v);
     if (!locked && !dae_acceleration(force, correction, a)) return false;
     if (!differentiate(force, a)) return false;
-    const Derivatives& by = derivatives;
-    const auto changed = [this](const Matrix& u_part, const Matrix& tree_part) -> const Matrix& {
+    const DynamicsDerivatives& by = derivatives;
+    const auto right_hand_side = [this](const Matrix& u_part, const Matrix& tree_part) -> const Matrix& {
       change_ = -tree_part;
       if (u_part.size()) change_ += u_part;
       return change_;
     };
-    if (!respond(changed(u_by_q, by.force_by_q), by.row_by_q, by_q) ||
-        !respond(changed(u_by_v, by.force_by_v), by.row_by_v, by_v))
+    if (!solve_acceleration_derivatives(right_hand_side(u_by_q, by.force_by_q), by.row_by_q, by_q) ||
+        !solve_acceleration_derivatives(right_hand_side(u_by_v, by.force_by_v), by.row_by_v, by_v))
       return false;
-    if (by_u && !respond(Matrix::Identity(n, n), Matrix::Zero(rows.closure.rows, n), of_u)) return false;
+    if (with_u &&
+        !solve_acceleration_derivatives(Matrix::Identity(n, n), Matrix::Zero(constraints.closure.rows, n), by_u))
+      return false;
   }
   if (locked) {
-    Vector back(n);
-    for (Matrix* by : {&by_q, &by_v, by_u})
+    Vector locked_correction(n);
+    for (Matrix* by : {&by_q, &by_v, with_u ? &by_u : nullptr})
       for (int k = 0; by && k < n; ++k) {
-        joints.back(responses_, by->col(k), back);
-        by->col(k) += back;
+        joints.compute_correction(responses_, by->col(k), locked_correction);
+        by->col(k) += locked_correction;
       }
   }
   return finite(by_q.reshaped()) && finite(by_v.reshaped());
 }
 
-bool Core::written_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
-  return written && written->acceleration(q_tree, v, u_tree, correction, acceleration);
+bool Core::compiled_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
+  return compiled && compiled->acceleration(q_tree, v, u_tree, correction, acceleration);
 }
 
 }  // namespace ckc

@@ -15,7 +15,7 @@ void unique(Indices& of) {
 
 }  // namespace
 
-Derivatives::Derivatives(Tree& tree, const Closure& closure, const SpringTable& springs)
+DynamicsDerivatives::DynamicsDerivatives(Tree& tree, const Closure& closure, const SpringTable& springs)
     : tree_(tree), closure_(closure), springs_(springs), pairs_(static_cast<int>(closure.point_joint.size()) / 2) {
   for (Matrix* x : {&row_by_q, &row_by_v, &rate_by_q, &J}) x->setZero(closure.rows, tree.n);
   const auto pair = [&](int k) { used_points_.push_back(k), used_points_.push_back(pairs_ + k); };
@@ -28,21 +28,21 @@ Derivatives::Derivatives(Tree& tree, const Closure& closure, const SpringTable& 
   for (const auto& rows : closure.logs) joints_.push_back(rows.joint_a), joints_.push_back(rows.joint_b);
   joints_.insert(joints_.end(), springs.point_joint.begin(), springs.point_joint.end());
   unique(joints_);
-  sways_.resize(tree.joints), points_.resize(closure.point_joint.size());
-  directions_.resize(closure.direction_joint.size()), ends_.resize(springs.point_joint.size());
+  joint_motion_.resize(tree.joints), points_.resize(closure.point_joint.size());
+  directions_.resize(closure.direction_joint.size()), spring_ends_.resize(springs.point_joint.size());
   by_.setZero(tree.n), dot_by_.setZero(tree.n);
 }
 
-void Derivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
-  tree_.derivatives(q, v, a, !impulsive, force_by_q, force_by_v);
-  for (int joint : joints_) changes_of(tree_, joint, sways_[joint]);
+void DynamicsDerivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
+  tree_.compute_derivatives(q, v, a, !impulsive, force_by_q, force_by_v);
+  for (int joint : joints_) compute_motion_derivatives(tree_, joint, joint_motion_[joint]);
   for (int k : used_points_) {
     const int joint = closure_.point_joint[k];
-    points_[k].set(tree_, joint, closure_.point_local[k], true, sways_[joint]);
+    points_[k].set(tree_, joint, closure_.point_local[k], true, joint_motion_[joint]);
   }
   for (int k : used_directions_) {
     const int joint = closure_.direction_joint[k];
-    directions_[k].set(tree_, joint, closure_.direction_local[k], false, sways_[joint]);
+    directions_[k].set(tree_, joint, closure_.direction_local[k], false, joint_motion_[joint]);
   }
   for (Matrix* x : {&row_by_q, &row_by_v, &rate_by_q, &J}) x->setZero();
   for (const auto& row : closure_.components) add_component(row, lambda(row.out));
@@ -53,7 +53,8 @@ void Derivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
   if (!impulsive) add_springs();
 }
 
-void Derivatives::add(int row, const Carried& x, const Vector3& w, const Vector3& w_dot, const Vector3& w_ddot) {
+void DynamicsDerivatives::add_row(int row, const AttachedVector& x, const Vector3& w, const Vector3& w_dot,
+                                  const Vector3& w_ddot) {
   const Indices& support = tree_.support[x.joint];
   for (size_t k = 0; k < support.size(); ++k) {
     const int j = support[k];
@@ -64,8 +65,9 @@ void Derivatives::add(int row, const Carried& x, const Vector3& w, const Vector3
   }
 }
 
-// A coordinate turns all changes along those below it, and along those of its own joint.
-void Derivatives::bend(const Carried& x, const Vector3& force) {
+// Second derivative of force . x along two coordinates. A coordinate rotates the axes of its own joint and of all
+// below.
+void DynamicsDerivatives::add_curvature(const AttachedVector& x, const Vector3& force) {
   const Indices& support = tree_.support[x.joint];
   for (size_t b = 0; b < support.size(); ++b)
     for (size_t a = 0; a < support.size(); ++a) {
@@ -77,58 +79,61 @@ void Derivatives::bend(const Carried& x, const Vector3& force) {
     }
 }
 
-void Derivatives::product(const Carried& x, const Carried& y, double weight) {
+void DynamicsDerivatives::add_product(const AttachedVector& x, const AttachedVector& y, double weight) {
   const Indices &of = tree_.support[x.joint], &along = tree_.support[y.joint];
   for (size_t i = 0; i < of.size(); ++i)
-    for (size_t k = 0; k < along.size(); ++k)
-      force_by_q(of[i], along[k]) -= weight * x.by_q.col(i).dot(y.by_q.col(k));
+    for (size_t k = 0; k < along.size(); ++k) force_by_q(of[i], along[k]) -= weight * x.by_q.col(i).dot(y.by_q.col(k));
 }
 
-void Derivatives::add_component(const Component& row, double lambda) {
-  const Carried &a = points_[row.pair], &b = points_[pairs_ + row.pair], &e = directions_[row.direction];
+void DynamicsDerivatives::add_component(const Component& row, double lambda) {
+  const AttachedVector &a = points_[row.pair], &b = points_[pairs_ + row.pair], &e = directions_[row.direction];
   const Vector3 r = a.x - b.x, r_dot = a.x_dot - b.x_dot, r_ddot = a.x_ddot - b.x_ddot;
-  add(row.out, a, e.x, e.x_dot, e.x_ddot), add(row.out, b, -e.x, -e.x_dot, -e.x_ddot), add(row.out, e, r, r_dot, r_ddot);
-  bend(a, lambda * e.x), bend(b, -lambda * e.x), bend(e, lambda * r);
-  product(e, a, lambda), product(a, e, lambda), product(e, b, -lambda), product(b, e, -lambda);
+  add_row(row.out, a, e.x, e.x_dot, e.x_ddot), add_row(row.out, b, -e.x, -e.x_dot, -e.x_ddot),
+      add_row(row.out, e, r, r_dot, r_ddot);
+  add_curvature(a, lambda * e.x), add_curvature(b, -lambda * e.x), add_curvature(e, lambda * r);
+  add_product(e, a, lambda), add_product(a, e, lambda), add_product(e, b, -lambda), add_product(b, e, -lambda);
 }
 
-void Derivatives::add_dot(const Dot& row, double lambda) {
-  const Carried &a = directions_[row.a], &b = directions_[row.b];
-  add(row.out, a, b.x, b.x_dot, b.x_ddot), add(row.out, b, a.x, a.x_dot, a.x_ddot);
-  bend(a, lambda * b.x), bend(b, lambda * a.x);
-  product(a, b, lambda), product(b, a, lambda);
+void DynamicsDerivatives::add_dot(const Dot& row, double lambda) {
+  const AttachedVector &a = directions_[row.a], &b = directions_[row.b];
+  add_row(row.out, a, b.x, b.x_dot, b.x_ddot), add_row(row.out, b, a.x, a.x_dot, a.x_ddot);
+  add_curvature(a, lambda * b.x), add_curvature(b, lambda * a.x);
+  add_product(a, b, lambda), add_product(b, a, lambda);
 }
 
-void Derivatives::add_distance(const Distance& row, double lambda) {
-  const Carried &a = points_[row.pair], &b = points_[pairs_ + row.pair];
+void DynamicsDerivatives::add_distance(const Distance& row, double lambda) {
+  const AttachedVector &a = points_[row.pair], &b = points_[pairs_ + row.pair];
   const double part = 1.0 / row.length, weight = part * lambda;
   const Vector3 r = part * (a.x - b.x), r_dot = part * (a.x_dot - b.x_dot), r_ddot = part * (a.x_ddot - b.x_ddot);
-  add(row.out, a, r, r_dot, r_ddot), add(row.out, b, -r, -r_dot, -r_ddot);
-  bend(a, lambda * r), bend(b, -lambda * r);
-  product(a, a, weight), product(b, b, weight), product(a, b, -weight), product(b, a, -weight);
+  add_row(row.out, a, r, r_dot, r_ddot), add_row(row.out, b, -r, -r_dot, -r_ddot);
+  add_curvature(a, lambda * r), add_curvature(b, -lambda * r);
+  add_product(a, a, weight), add_product(b, b, weight), add_product(a, b, -weight), add_product(b, a, -weight);
 }
 
 // u = log(R_A^T R_B), u_dot = Jlog(u) R_B^T (omega_B - omega_A).
-void Derivatives::add_log(const RelativeLog& rows, In lambda) {
-  const Matrix3 r_a = tree_.rotation(rows.joint_a) * rows.rotation_a, r_b = tree_.rotation(rows.joint_b) * rows.rotation_b;
-  const LogRate log(log3(r_a.transpose() * r_b));
-  const Vector3 omega_b = tree_.motion(rows.joint_b).tail<3>();
-  const Vector3 omega = omega_b - tree_.motion(rows.joint_a).tail<3>();
-  const Vector3 alpha = (tree_.motion_rate(rows.joint_b) - tree_.motion_rate(rows.joint_a)).tail<3>();
+void DynamicsDerivatives::add_log(const RelativeLog& rows, In lambda) {
+  const Matrix3 r_a = tree_.rotation(rows.joint_a) * rows.rotation_a,
+                r_b = tree_.rotation(rows.joint_b) * rows.rotation_b;
+  const LogJacobian log(log3(r_a.transpose() * r_b));
+  const Vector3 omega_b = tree_.velocity(rows.joint_b).tail<3>();
+  const Vector3 omega = omega_b - tree_.velocity(rows.joint_a).tail<3>();
+  const Vector3 alpha = (tree_.acceleration(rows.joint_b) - tree_.acceleration(rows.joint_a)).tail<3>();
   const Vector3 turning = alpha - omega_b.cross(omega), y = r_b.transpose() * omega, y_dot = r_b.transpose() * turning;
   const Vector3 u_dot = log.value * y;
-  const Matrix3 value_dot = log.along(u_dot);
+  const Matrix3 value_dot = log.derivative(u_dot);
   const Vector3 force(lambda(rows.out[0]), lambda(rows.out[1]), lambda(rows.out[2]));
   const int n = tree_.n;
-  Carried::Columns place = Carried::Columns::Zero(3, n), velocity = place, rate = place, rate_by_v = place, of_b = place, velocity_b = place;
+  AttachedVector::Columns place = AttachedVector::Columns::Zero(3, n), velocity = place, rate = place,
+                          rate_by_v = place, of_b = place, velocity_b = place;
   const auto put = [&](int joint, double sign) {
     const Indices& support = tree_.support[joint];
-    const Sway& s = sways_[joint];
+    const JointMotionDerivatives& s = joint_motion_[joint];
     for (size_t k = 0; k < support.size(); ++k) {
       const int j = support[k];
-      place.col(j) += sign * s.place.col(k).tail<3>(), velocity.col(j) += sign * s.velocity.col(k).tail<3>();
-      rate.col(j) += sign * s.rate.col(k).tail<3>(), rate_by_v.col(j) += sign * s.rate_by_v.col(k).tail<3>();
-      if (sign > 0) of_b.col(j) = s.place.col(k).tail<3>(), velocity_b.col(j) = s.velocity.col(k).tail<3>();
+      place.col(j) += sign * s.axis.col(k).tail<3>(), velocity.col(j) += sign * s.velocity_by_q.col(k).tail<3>();
+      rate.col(j) += sign * s.acceleration_by_q.col(k).tail<3>(),
+          rate_by_v.col(j) += sign * s.acceleration_by_v.col(k).tail<3>();
+      if (sign > 0) of_b.col(j) = s.axis.col(k).tail<3>(), velocity_b.col(j) = s.velocity_by_q.col(k).tail<3>();
     }
   };
   put(rows.joint_a, -1.0), put(rows.joint_b, 1.0);
@@ -141,46 +146,49 @@ void Derivatives::add_log(const RelativeLog& rows, In lambda) {
     const Vector3 y_j = r_b.transpose() * (omega_j - theta_b.cross(omega));
     const Vector3 turning_j = rate.col(j) - velocity_b.col(j).cross(omega) - omega_b.cross(omega_j);
     const Vector3 y_dot_j = r_b.transpose() * (turning_j - theta_b.cross(turning));
-    const Vector3 u_dot_j = log.along(u_j) * y + log.value * y_j;
+    const Vector3 u_dot_j = log.derivative(u_j) * y + log.value * y_j;
     three(J, j, u_j), three(rate_by_q, j, u_dot_j);
-    three(row_by_q, j, log.along(u_j, u_dot) * y + log.along(u_dot_j) * y + value_dot * y_j + log.along(u_j) * y_dot + log.value * y_dot_j);
-    // with a velocity omega changes as the place does along its coordinate
+    three(row_by_q, j,
+          log.second_derivative(u_j, u_dot) * y + log.derivative(u_dot_j) * y + value_dot * y_j +
+              log.derivative(u_j) * y_dot + log.value * y_dot_j);
+    // the derivative of omega with respect to a velocity is the derivative of the orientation along its coordinate
     const Vector3 y_v = r_b.transpose() * theta, u_dot_v = log.value * y_v;
     const Vector3 turning_v = rate_by_v.col(j) - theta_b.cross(omega) - omega_b.cross(theta);
-    three(row_by_v, j, log.along(u_dot_v) * y + value_dot * y_v + log.value * (r_b.transpose() * turning_v));
-    for (int i = 0; i < n; ++i) {  // the force on i
+    three(row_by_v, j, log.derivative(u_dot_v) * y + value_dot * y_v + log.value * (r_b.transpose() * turning_v));
+    for (int i = 0; i < n; ++i) {  // the force on coordinate i
       const Vector3 theta_i = place.col(i);
       if (theta_i.isZero(0)) continue;
       const Indices& above = tree_.ancestors[i];
       const bool turns = tree_.joint_of[i] == tree_.joint_of[j] || std::binary_search(above.begin(), above.end(), j);
       const Vector3 axis = tree_.jacobian().col(j).tail<3>();
       const Vector3 turned = (turns ? axis.cross(theta_i) : Vector3::Zero()) - theta_b.cross(theta_i);
-      force_by_q(i, j) -= force.dot(log.along(u_j) * (r_b.transpose() * theta_i) + log.value * (r_b.transpose() * turned));
+      force_by_q(i, j) -=
+          force.dot(log.derivative(u_j) * (r_b.transpose() * theta_i) + log.value * (r_b.transpose() * turned));
     }
   }
 }
 
-void Derivatives::add_springs() {
+void DynamicsDerivatives::add_springs() {
   const SpringTable& s = springs_;
   const auto count = s.stiffness.size();
   force_by_q.diagonal() += s.joint_stiffness, force_by_v.diagonal() += s.joint_damping;
   for (Eigen::Index k = 0; k < count; ++k) {
     for (const Eigen::Index i : {k, count + k}) {
       const int joint = s.point_joint[i];
-      ends_[i].set(tree_, joint, s.point_local[i], true, sways_[joint]);
+      spring_ends_[i].set(tree_, joint, s.point_local[i], true, joint_motion_[joint]);
     }
-    const Carried &a = ends_[k], &b = ends_[count + k];
+    const AttachedVector &a = spring_ends_[k], &b = spring_ends_[count + k];
     const Vector3 r = a.x - b.x, r_dot = a.x_dot - b.x_dot;
     const double length = r.norm();
-    if (!(length > 0.0)) {  // only without a length at rest it pulls somewhere next to there
+    if (!(length > 0.0)) {  // A spring of length zero is differentiable only if its rest length is zero.
       const double pull = s.rest_length(k) == 0.0 ? -s.stiffness(k) : 0.0;
-      product(a, a, pull), product(b, b, pull), product(a, b, -pull), product(b, a, -pull);
+      add_product(a, a, pull), add_product(b, b, pull), add_product(a, b, -pull), add_product(b, a, -pull);
       continue;
     }
-    Vector &by = by_, &dot_by = dot_by_;  // of the length, of its rate
+    Vector &by = by_, &dot_by = dot_by_;  // derivatives of the length and of its rate
     by.setZero(), dot_by.setZero();
     const double length_dot = r.dot(r_dot) / length;
-    const auto put = [&](const Carried& x, double sign) {
+    const auto put = [&](const AttachedVector& x, double sign) {
       const Indices& support = tree_.support[x.joint];
       for (size_t i = 0; i < support.size(); ++i) {
         by(support[i]) += sign * r.dot(x.by_q.col(i)) / length;
@@ -189,9 +197,10 @@ void Derivatives::add_springs() {
     };
     put(a, 1.0), put(b, -1.0);
     dot_by -= length_dot / length * by;
-    const double pull = s.stiffness(k) * (length - s.rest_length(k)) + s.damping(k) * length_dot, weight = -pull / length;
-    bend(a, weight * r), bend(b, -weight * r);
-    product(a, a, weight), product(b, b, weight), product(a, b, -weight), product(b, a, -weight);
+    const double pull = s.stiffness(k) * (length - s.rest_length(k)) + s.damping(k) * length_dot,
+                 weight = -pull / length;
+    add_curvature(a, weight * r), add_curvature(b, -weight * r);
+    add_product(a, a, weight), add_product(b, b, weight), add_product(a, b, -weight), add_product(b, a, -weight);
     dot_by *= s.damping(k), dot_by += (s.stiffness(k) - pull / length) * by;
     force_by_q.noalias() += by * dot_by.transpose();
     force_by_v.noalias() += s.damping(k) * by * by.transpose();

@@ -5,77 +5,78 @@
 
 namespace ckc {
 
-// A coordinate, relative to the accelerations that the forces give. Mechanisms whose masses are alike have a tenth of it or less.
-constexpr double ordinary = 5e-14;
-// Accepted steps between checks, of which each costs about as much as two right-hand sides of the general core.
-constexpr int soon = 8, seldom = 128, often = 16;
+// Relative to the accelerations that the forces cause. Mechanisms with similar masses have a tenth of it or less.
+constexpr double max_rounding_per_coordinate = 5e-14;
+// Accepted steps between checks. A check costs about two right-hand sides with Pinocchio's terms.
+constexpr int first_interval = 8, regular_interval = 128, retry_interval = 16;
 
-// Redundant rows contradict each other off the closure, where eliminations that keep different ones differ: put (q', v') on it.
-// False where the compiled elimination would need pivots.
-static bool put_on_closure(Core& core, Vector& q_tree, Vector& v) {
-  constexpr int steps = 3;  // of Newton's method, from a state that the run's tolerance closes
+// Project (q', v') onto the constraint manifold. Off the manifold redundant rows contradict each other, so that
+// eliminations which keep different rows differ. False if the compiled elimination would need a pivot.
+static bool project_onto_manifold(Core& core, Vector& q_tree, Vector& v) {
+  constexpr int newton_steps = 3;  // starting from a state within the run's tolerance
   Vector step(core.n);
-  for (int k = 0; k < steps; ++k) {
-    core.set(q_tree);
-    if (!core.written->closing_step(q_tree, core.rows.phi, step)) return false;
+  for (int k = 0; k < newton_steps; ++k) {
+    core.set_configuration(q_tree);
+    if (!core.compiled->closure_step(q_tree, core.constraints.phi, step)) return false;
     core.tree.integrate(q_tree, step);
   }
-  core.set(q_tree);
-  if (!core.written->closing_step(q_tree, core.rows.J * v, step)) return false;
+  core.set_configuration(q_tree);
+  if (!core.compiled->closure_step(q_tree, core.constraints.J * v, step)) return false;
   v += step;
   return true;
 }
 
-void EliminationCheck::start(Core& core) {
-  if (core.written) core.written->allow_elimination(true);
-  uneven_ = core.has_uneven_masses();
-  core.use_levels(false);
-  active_ = uneven_ || core.written;
-  begun_ = known_ = false, wait_ = 0, next_wait_ = soon;
+void EliminationCheck::reset(Core& core) {
+  if (core.compiled) core.compiled->allow_elimination(true);
+  has_uneven_masses_ = core.has_uneven_masses();
+  core.use_mass_levels(false);
+  is_active_ = has_uneven_masses_ || core.compiled;
+  has_started_ = is_remembered_ = false, steps_until_check_ = 0, next_interval_ = first_interval;
 }
 
-void EliminationCheck::begin(Core& core, In v) {
-  if (begun_ || !active_) return;
-  begun_ = true;
-  remember(core.q_tree, v, Vector::Zero(core.n));
+void EliminationCheck::check_start(Core& core, In v) {
+  if (has_started_ || !is_active_) return;
+  has_started_ = true;
+  remember_state(core.q_tree, v, Vector::Zero(core.n));
   check(core);
 }
 
-void EliminationCheck::accept(Core& core) {
-  if (!active_) return;
-  if (wait_ > 0)
-    --wait_;
-  else if (known_)
+void EliminationCheck::accept_step(Core& core) {
+  if (!is_active_) return;
+  if (steps_until_check_ > 0)
+    --steps_until_check_;
+  else if (is_remembered_)
     check(core);
 }
 
-bool EliminationCheck::give_up(Core& core) {
-  if (!core.written || !active_) return false;
-  core.written->allow_elimination(false);
-  active_ = false;
+bool EliminationCheck::disable_compiled_elimination(Core& core) {
+  if (!core.compiled || !is_active_) return false;
+  core.compiled->allow_elimination(false);
+  is_active_ = false;
   return true;
 }
 
 void EliminationCheck::check(Core& core) {
-  known_ = false;
-  const double limit = ordinary * core.n;
-  if (core.q_tree != q_tree_) core.set(q_tree_);
+  is_remembered_ = false;
+  const double limit = max_rounding_per_coordinate * core.n;
+  if (core.q_tree != q_tree_) core.set_configuration(q_tree_);
   core.set_velocity(v_);
-  if (uneven_ && !core.uses_levels()) core.use_levels(core.rounding_of_projection(u_tree_) > limit);
-  bool good = true;
-  if (core.written) {
-    core.written->allow_elimination(true);
-    const bool redundant = core.rank < core.rows.closure.rows;
+  if (has_uneven_masses_ && !core.uses_mass_levels())
+    core.use_mass_levels(core.rounding_of_projection(u_tree_) > limit);
+  bool is_accurate = true;
+  if (core.compiled) {
+    core.compiled->allow_elimination(true);
+    const bool redundant = core.rank < core.constraints.closure.rows;
     Vector q_tree = q_tree_, v = v_;
-    if (!redundant || put_on_closure(core, q_tree, v)) {
+    if (!redundant || project_onto_manifold(core, q_tree, v)) {
       core.set_velocity(v);
-      good = core.rounding_of_elimination(u_tree_) <= limit;
+      is_accurate = core.rounding_of_elimination(u_tree_) <= limit;
     }
-    if (redundant) core.set(q_tree_), core.set_velocity(v_);
-    core.written->allow_elimination(good);
+    if (redundant) core.set_configuration(q_tree_), core.set_velocity(v_);
+    core.compiled->allow_elimination(is_accurate);
   }
-  wait_ = good ? next_wait_ : often;
-  next_wait_ = seldom;
+  steps_until_check_ = is_accurate ? next_interval_ : retry_interval;
+  next_interval_ = regular_interval;
 }
 
 }  // namespace ckc

@@ -1,9 +1,10 @@
-// By which elimination a run takes eq. 1's acceleration: judged by its rounding in the numbers in use, at the start and along
-// the motion.
+// Chooses the elimination by which a run computes the acceleration of eq. 1, from its rounding errors at the start
+// and along the motion.
 //
-// The compiled elimination has no pivoting and an order that was chosen for the masses of the mechanism's files. With masses far
-// from these it rounds up to a million times as much as projection on the tangent space does: where a light body carries a
-// load, the acceleration that the load alone would give it cancels. Step-size control then sees noise.
+// The compiled elimination does not pivot, and its order was chosen for the masses in the mechanism's files. With
+// very different masses it can round up to a million times as much as projection on the tangent space: if a light
+// body carries a heavy load, the acceleration that the load alone would cause cancels. Step size control then sees
+// noise.
 #pragma once
 
 #include "tree/types.hpp"
@@ -14,24 +15,26 @@ class Core;
 
 class EliminationCheck {
  public:
-  // Forget what was before: the first state of a run is checked.
-  void start(Core& core);
-  // Where a motion begins: the core is there, and moves with v.
-  void begin(Core& core, In v);
-  // Whether the next accepted state will be checked; `remember` is then called where a step ends there.
-  bool is_due() const { return active_ && wait_ == 0; }
-  void remember(In q_tree, In v, In u_tree) { q_tree_ = q_tree, v_ = v, u_tree_ = u_tree, known_ = true; }
-  // A state was accepted. Where the check is due, the core is left at the configuration remembered.
-  void accept(Core& core);
-  // Take the general core's elimination for the rest of the run; false where that is done already, or nothing is compiled.
-  bool give_up(Core& core);
+  // Forget the previous run. The first state of the next run is checked.
+  void reset(Core& core);
+  // Check the start of a motion. The core is there and moves with v.
+  void check_start(Core& core, In v);
+  // Whether the next accepted state will be checked. If so, call `remember_state` at the end of each step.
+  bool is_due() const { return is_active_ && steps_until_check_ == 0; }
+  void remember_state(In q_tree, In v, In u_tree) { q_tree_ = q_tree, v_ = v, u_tree_ = u_tree, is_remembered_ = true; }
+  // Call after a step is accepted. If a check is due, the core is left at the remembered configuration.
+  void accept_step(Core& core);
+  // Do not use the compiled elimination for the rest of the run. False if there is none or it is already disabled.
+  bool disable_compiled_elimination(Core& core);
 
  private:
   void check(Core& core);
 
-  bool active_ = false, uneven_ = false;  // whether there is something to check; whether masses are very unequal
-  bool begun_ = false, known_ = false;
-  int wait_ = 0, next_wait_ = 0;  // accepted steps until the next check, and from there until the one after it
+  // whether there is something to check; whether masses differ widely
+  bool is_active_ = false, has_uneven_masses_ = false;
+  bool has_started_ = false, is_remembered_ = false;
+  // accepted steps until the next check, and from that to the one after it
+  int steps_until_check_ = 0, next_interval_ = 0;
   Vector q_tree_, v_, u_tree_;
 };
 

@@ -5,31 +5,34 @@
 
 namespace ckc {
 
-constexpr double poor = 1e-5;      // least of what a motion of size one moves the coordinates: below that they are no chart
-constexpr double sound = 1e-2;      // of phi_z's pivots: q is as good a chart as any
-constexpr double at_rest = 1e-9;   // of a tangent basis' largest entry: a coordinate that locked ones leave no motion
+// of the coordinates' part of an orthonormal basis; below it they are no valid chart
+constexpr double min_chart_singular_value = 1e-5;
+constexpr double min_phi_z_pivot = 1e-2;  // of phi_z: above it q is a valid chart
+// of the largest entry of a tangent basis: below it a coordinate is fixed by locked ones
+constexpr double locked_motion_tolerance = 1e-9;
 
-Plant::Plant(std::unique_ptr<Core> core_, Matrix turns_) : core(std::move(core_)), turns(std::move(turns_)) {
-  a.setZero(core->n), residual_.setZero(core->rows.closure.rows);
+Linearization::Linearization(std::unique_ptr<Core> core_, Matrix transmission_)
+    : core(std::move(core_)), transmission(std::move(transmission_)) {
+  acceleration.a.setZero(core->n), residual_.setZero(core->constraints.closure.rows);
 }
 
-bool Plant::compute(In q_tree, In v, In u_tree, const Indices& locked) {
+bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked) {
   Core& c = *core;
   c.joints.locked = locked;
-  c.set(q_tree, true), c.set_velocity(v);
-  force_ = given_ = u_tree;
-  u_by_q_.resize(0, 0), u_by_v_.resize(0, 0), residual_.setZero();
-  if (!c.slopes(c.q_tree, v, residual_, force_, u_by_q_, u_by_v_, a, a_q, a_v, &a_u) || !basis()) return false;
-  follow(v), assemble(v);
+  c.set_configuration(q_tree, true), c.set_velocity(v);
+  constant_force_ = u_tree, residual_.setZero();
+  force_ = {u_tree, {}, {}};
+  if (!c.acceleration_derivatives(c.q_tree, v, residual_, force_, acceleration, true) || !find_basis()) return false;
+  compute_velocity_dependence(v), assemble_A_B(v);
   return true;
 }
 
-Plant::Pivoted Plant::with_locked() const {
+Linearization::Pivoted Linearization::factorize_with_locked_rows() const {
   const Core& c = *core;
   const Indices& locked = c.joints.locked;
-  const Eigen::Index m = c.rows.closure.rows;
+  const Eigen::Index m = c.constraints.closure.rows;
   Matrix rows = Matrix::Zero(m + static_cast<Eigen::Index>(locked.size()), c.n);
-  rows.topRows(m) = c.scales.rows.asDiagonal() * c.rows.J * c.scales.columns.asDiagonal();
+  rows.topRows(m) = c.scales.rows.asDiagonal() * c.constraints.J * c.scales.columns.asDiagonal();
   for (size_t i = 0; i < locked.size(); ++i) rows(m + static_cast<Eigen::Index>(i), locked[i]) = 1.0;
   Pivoted qr;
   qr.setThreshold(c.scales.rank);
@@ -37,58 +40,59 @@ Plant::Pivoted Plant::with_locked() const {
   return qr;
 }
 
-bool Plant::basis() {
+bool Linearization::find_basis() {
   Core& c = *core;
-  own_ = false;
-  if (!c.joints.locked.empty()) return c.jacobian(), basis_of(with_locked()), true;
+  uses_rho_ = false;
+  if (!c.joints.locked.empty()) return c.compute_J(), set_basis_from(factorize_with_locked_rows()), true;
   if (c.rank) {
-    c.factor();
-    own_ = c.phi_z.pivot_ratio() > sound;
+    c.factorize_phi_z();
+    uses_rho_ = c.phi_z.pivot_ratio() > min_phi_z_pivot;
   }
-  if (own_) return c.reduce(), T = c.rho, at = c.q, true;
-  const Matrix* tangent = c.tangent();
+  if (uses_rho_) return c.compute_rho(), T = c.rho, at = c.q, true;
+  const Matrix* tangent = c.compute_tangent_basis();
   if (!tangent) return false;
-  T = *tangent, choose(c.free());
+  T = *tangent, choose_coordinates(c.basis_coordinates());
   return true;
 }
 
-// J P = Q [R S]: the columns that the pivoting left over are the freedoms.
-void Plant::basis_of(const Pivoted& qr) {
+// J P = Q [R S]. The columns that pivoting leaves over are the freedoms.
+void Linearization::set_basis_from(const Pivoted& qr) {
   const Vector& columns = core->scales.columns;
   const Eigen::Index n = core->n, rank = qr.rank();
   const auto& order = qr.colsPermutation().indices();
-  Matrix follows = qr.matrixQR().topRightCorner(rank, n - rank);
-  qr.matrixQR().topLeftCorner(rank, rank).triangularView<Eigen::Upper>().solveInPlace(follows);
+  Matrix dependent = qr.matrixQR().topRightCorner(rank, n - rank);
+  qr.matrixQR().topLeftCorner(rank, rank).triangularView<Eigen::Upper>().solveInPlace(dependent);
   Indices free;
   T.setZero(n, n - rank);
   for (Eigen::Index j = 0; j < n - rank; ++j) {
     free.push_back(order(rank + j));
-    for (Eigen::Index i = 0; i < rank; ++i) T(order(i), j) = -follows(i, j) * columns(order(i)) / columns(free.back());
+    for (Eigen::Index i = 0; i < rank; ++i)
+      T(order(i), j) = -dependent(i, j) * columns(order(i)) / columns(free.back());
     T(free.back(), j) = 1.0;
   }
   for (int k : core->joints.locked) T.row(k).setZero();
-  choose(free);
+  choose_coordinates(free);
 }
 
-// The mechanism's own q, less what is locked, or where that is no chart what the basis is of.
-void Plant::choose(const Indices& free) {
+// Use the mechanism's own q without locked coordinates. If that is no valid chart, use the coordinates of the basis.
+void Linearization::choose_coordinates(const Indices& free) {
   at.clear();
-  const double least = at_rest * T.lpNorm<Eigen::Infinity>();
+  const double max_entry = locked_motion_tolerance * T.lpNorm<Eigen::Infinity>();
   for (int k : core->q)
-    if (core->joints.locked.empty() || T.row(k).lpNorm<Eigen::Infinity>() > least) at.push_back(k);
+    if (core->joints.locked.empty() || T.row(k).lpNorm<Eigen::Infinity>() > max_entry) at.push_back(k);
   if (at == free) return;
   const auto d = static_cast<Eigen::Index>(free.size());
   if (static_cast<Eigen::Index>(at.size()) == d) {
-    const auto of_chart = [&](const Matrix& basis) {
+    const auto chart_rows = [&](const Matrix& find_basis) {
       Matrix part(d, d);
-      for (Eigen::Index i = 0; i < d; ++i) part.row(i) = basis.row(at[i]);
+      for (Eigen::Index i = 0; i < d; ++i) part.row(i) = find_basis.row(at[i]);
       return part;
     };
     const Matrix free_of_units = core->scales.columns.cwiseInverse().asDiagonal() * T;
-    const Matrix motions = free_of_units.householderQr().householderQ() * Matrix::Identity(core->n, d);
-    if (of_chart(motions).jacobiSvd().singularValues()(d - 1) > poor) {
-      const Matrix turned = of_chart(T).partialPivLu().transpose().solve(Matrix(T.transpose()));
-      T = turned.transpose();
+    const Matrix orthonormal_basis = free_of_units.householderQr().householderQ() * Matrix::Identity(core->n, d);
+    if (chart_rows(orthonormal_basis).jacobiSvd().singularValues()(d - 1) > min_chart_singular_value) {
+      const Matrix rotated = chart_rows(T).partialPivLu().transpose().solve(Matrix(T.transpose()));
+      T = rotated.transpose();
       for (Eigen::Index i = 0; i < d; ++i) T.row(at[i]).setZero(), T(at[i], i) = 1.0;
       return;
     }
@@ -96,30 +100,30 @@ void Plant::choose(const Indices& free) {
   at = free;
 }
 
-// J V = -(d (J v') / d q') T, of others than those coordinates.
-void Plant::follow(In v) {
+// J V = -(d (J v') / d q') T, with zero rows for the states' own coordinates.
+void Linearization::compute_velocity_dependence(In v) {
   Core& c = *core;
   V.setZero(T.rows(), T.cols());
-  if (v.isZero(0) || !c.rows.closure.rows) return;
-  c.closure_rate(v, opened_);
-  const Eigen::Index d = T.cols(), m = opened_.rows();
+  if (v.isZero(0) || !c.constraints.closure.rows) return;
+  c.constraint_rate_derivative(v, rate_by_q_);
+  const Eigen::Index d = T.cols(), m = rate_by_q_.rows();
   if (c.joints.locked.empty()) {
     for (Eigen::Index k = 0; k < d; ++k) {
-      residual_ = opened_.lazyProduct(T.col(k));
-      own_ ? c.z_step(residual_, V.col(k)) : c.particular(residual_, V.col(k));
+      residual_ = rate_by_q_.lazyProduct(T.col(k));
+      uses_rho_ ? c.closure_step_in_z(residual_, V.col(k)) : c.particular_solution(residual_, V.col(k));
     }
-    if (own_) return;
+    if (uses_rho_) return;
   } else {
-    const Pivoted qr = with_locked();
+    const Pivoted qr = factorize_with_locked_rows();
     const Eigen::Index rank = qr.rank();
-    Matrix lacking = Matrix::Zero(qr.rows(), d);
-    lacking.topRows(m) = c.scales.rows.asDiagonal() * (opened_ * T);
-    lacking.applyOnTheLeft(qr.householderQ().adjoint());
-    Matrix moved = lacking.topRows(rank);
-    qr.matrixQR().topLeftCorner(rank, rank).triangularView<Eigen::Upper>().solveInPlace(moved);
+    Matrix residual = Matrix::Zero(qr.rows(), d);
+    residual.topRows(m) = c.scales.rows.asDiagonal() * (rate_by_q_ * T);
+    residual.applyOnTheLeft(qr.householderQ().adjoint());
+    Matrix solution = residual.topRows(rank);
+    qr.matrixQR().topLeftCorner(rank, rank).triangularView<Eigen::Upper>().solveInPlace(solution);
     for (Eigen::Index i = 0; i < rank; ++i) {
       const auto k = qr.colsPermutation().indices()(i);
-      V.row(k) = -c.scales.columns(k) * moved.row(i);
+      V.row(k) = -c.scales.columns(k) * solution.row(i);
     }
     for (int k : c.joints.locked) V.row(k).setZero();
   }
@@ -129,8 +133,8 @@ void Plant::follow(In v) {
   for (int k : at) V.row(k).setZero();
 }
 
-void Plant::assemble(In v) {
-  const Eigen::Index n = T.rows(), d = T.cols(), motors = turns.rows();
+void Linearization::assemble_A_B(In v) {
+  const Eigen::Index n = T.rows(), d = T.cols(), motors = transmission.rows();
   A.setZero(2 * d, 2 * d), B.setZero(2 * d, motors);
   for (Eigen::Index i = 0; i < d; ++i) {
     const int row = at[i];
@@ -138,60 +142,61 @@ void Plant::assemble(In v) {
     for (Eigen::Index j = 0; j < d; ++j) {
       double by_place = 0.0, by_rate = 0.0;
       for (Eigen::Index k = 0; k < n; ++k)
-        by_place += a_q(row, k) * T(k, j) + a_v(row, k) * V(k, j), by_rate += a_v(row, k) * T(k, j);
+        by_place += acceleration.by_q(row, k) * T(k, j) + acceleration.by_v(row, k) * V(k, j),
+            by_rate += acceleration.by_v(row, k) * T(k, j);
       A(d + i, j) = by_place, A(d + i, d + j) = by_rate;
     }
     for (Eigen::Index j = 0; j < motors; ++j) {
       double by_motor = 0.0;
-      for (Eigen::Index k = 0; k < n; ++k) by_motor += a_u(row, k) * turns(j, k);
+      for (Eigen::Index k = 0; k < n; ++k) by_motor += acceleration.by_u(row, k) * transmission(j, k);
       B(d + i, j) = by_motor;
     }
   }
   if (core->tree.roots.empty()) return;
-  const Matrix turned = core->tree.brackets(v) * T;
-  for (Eigen::Index i = 0; i < d; ++i) A.row(i).head(d) -= turned.row(at[i]);
+  const Matrix rotated = core->tree.bracket_matrix(v) * T;
+  for (Eigen::Index i = 0; i < d; ++i) A.row(i).head(d) -= rotated.row(at[i]);
 }
 
-// D' da + dR = J^T dlambda with R = D' a + C' v' + h' less what acts and J^T lambda.
-void Plant::solve() {
+// D' da + dR = J^T dlambda with R = D' a + C' v' + h' minus applied forces and J^T lambda.
+void Linearization::solve_multipliers() {
   Core& c = *core;
   const Indices& locked = c.joints.locked;
-  const Eigen::Index n = c.n, m = c.rows.closure.rows;
+  const Eigen::Index n = c.n, m = c.constraints.closure.rows;
   residual_.setZero();
-  if (locked.empty()) c.dae_acceleration(force_, residual_, a);
+  if (locked.empty()) c.dae_acceleration(force_.value, residual_, acceleration.a);
   lambda.setZero(m);
   for (Matrix* x : {&lambda_q, &lambda_v, &lambda_u}) x->setZero(m, n);
   if (!m) return;
-  c.jacobian(), c.bias(), c.tree_inertia();
+  c.compute_J(), c.compute_bias(), c.compute_D_tree();
   Matrix J = Matrix::Zero(m + static_cast<Eigen::Index>(locked.size()), n);
-  J.topRows(m) = c.rows.J;
+  J.topRows(m) = c.constraints.J;
   for (size_t i = 0; i < locked.size(); ++i) J(m + static_cast<Eigen::Index>(i), locked[i]) = 1.0;
-  const Eigen::Index rank = n - T.cols();  // whatever rounding makes of rows that the others imply
+  const Eigen::Index rank = n - T.cols();  // independent of rounding in redundant rows
   const Eigen::BDCSVD<Matrix> svd(J, Eigen::ComputeThinU | Eigen::ComputeThinV);
   const Matrix inverse = svd.matrixV().leftCols(rank) * svd.singularValues().head(rank).cwiseInverse().asDiagonal() *
                          svd.matrixU().leftCols(rank).transpose();
   const auto D_times = [&](const Matrix& x) {
     Matrix product(n, x.cols());
-    for (Eigen::Index k = 0; k < x.cols(); ++k) c.D_times(x.col(k), product.col(k));
+    for (Eigen::Index k = 0; k < x.cols(); ++k) c.multiply_D_tree(x.col(k), product.col(k));
     return product;
   };
-  Vector lacking = given_, slope = Vector::Zero(n), v = c.v_tree;
-  c.joints.add_friction(v, lacking), c.joints.add_slopes(v, slope);
-  lacking = D_times(a) + c.bias_tree - c.damping_tree - lacking;
-  const Vector all = inverse.transpose() * lacking;
-  lambda = all.head(m);
-  const Matrix of_q = D_times(a_q), of_v = D_times(a_v), of_u = D_times(a_u);
-  c.derivatives.compute(c.q_tree, v, a, lambda);
-  const Matrix least = inverse.leftCols(m).transpose();
-  lambda_q = least * (of_q + c.derivatives.force_by_q);
-  lambda_v = least * (of_v + c.derivatives.force_by_v - Matrix(slope.asDiagonal()));
-  lambda_u = least * (of_u - Matrix::Identity(n, n));
+  Vector residual = constant_force_, friction_derivative = Vector::Zero(n), v = c.v_tree;
+  c.joints.add_friction_force(v, residual), c.joints.add_friction_derivative(v, friction_derivative);
+  residual = D_times(acceleration.a) + c.bias_tree - c.damping_tree - residual;
+  const Vector all_multipliers = inverse.transpose() * residual;
+  lambda = all_multipliers.head(m);
+  const Matrix of_q = D_times(acceleration.by_q), of_v = D_times(acceleration.by_v), of_u = D_times(acceleration.by_u);
+  c.derivatives.compute(c.q_tree, v, acceleration.a, lambda);
+  const Matrix minimum_norm = inverse.leftCols(m).transpose();
+  lambda_q = minimum_norm * (of_q + c.derivatives.force_by_q);
+  lambda_v = minimum_norm * (of_v + c.derivatives.force_by_v - Matrix(friction_derivative.asDiagonal()));
+  lambda_u = minimum_norm * (of_u - Matrix::Identity(n, n));
   if (rank == J.rows()) return;
-  // what keeps them the least ones as the range of J turns
-  c.closure_rate(inverse * all, opened_);
-  Matrix turned = Matrix::Zero(J.rows(), n);
-  turned.topRows(m) = opened_;
-  lambda_q += (turned - J * (inverse * turned)).topRows(m);
+  // the term that keeps lambda minimum-norm while the range of J rotates
+  c.constraint_rate_derivative(inverse * all_multipliers, rate_by_q_);
+  Matrix rotated = Matrix::Zero(J.rows(), n);
+  rotated.topRows(m) = rate_by_q_;
+  lambda_q += (rotated - J * (inverse * rotated)).topRows(m);
   c.set_velocity(v);
 }
 

@@ -1,4 +1,4 @@
-// A mechanism about one state: eq. 1 in minimal coordinates, differentiated exactly.
+// Exact linearization of eq. 1 about one state, in minimal coordinates.
 #pragma once
 
 #include <memory>
@@ -9,38 +9,40 @@
 
 namespace ckc {
 
-class Plant {
+// Linearizes eq. 1 at one state after another. The states are d coordinates and their rates.
+class Linearization {
  public:
-  // `turns`: of the motors by the coordinates' rates, (motors, n).
-  Plant(std::unique_ptr<Core> core, Matrix turns);
+  // `transmission`: motor rates per coordinate rate, (motors, n).
+  Linearization(std::unique_ptr<Core> core, Matrix transmission);
 
-  // At (q', v') where u' acts, which does not change with the state, beside smooth friction; `locked` coordinates do not
-  // move. False where J has lost rank.
+  // Linearize at (q', v') under u', which does not depend on the state; smooth friction is added. `locked`
+  // coordinates do not move. False if J has lost rank.
   bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked);
-  // After it: a and the least multipliers, and how these change.
-  void solve();
+  // After `compute`: the acceleration, minimum-norm multipliers, and the multipliers' derivatives.
+  void solve_multipliers();
 
   const std::unique_ptr<Core> core;
-  const Matrix turns;
-  Indices at;                   // (d): the coordinates that the states are of
-  Matrix T, V;                  // (n, d): v' by the rates of those, and by those, as the loops ask for it
-  Matrix A, B;                  // (2 d, 2 d), (2 d, motors)
-  Vector a, lambda;             // (n), (rows)
-  Matrix a_q, a_v, a_u;         // (n, n): of a by q' (tangent), v' and u'
+  const Matrix transmission;
+  Indices at;   // (d): coordinates of the states
+  Matrix T, V;  // (n, d): derivatives of v' with respect to the states' rates, and their positions
+  Matrix A, B;  // (2 d, 2 d), (2 d, motors)
+  AccelerationDerivatives acceleration;
+  Vector lambda;                        // (rows)
   Matrix lambda_q, lambda_v, lambda_u;  // (rows, n)
 
  private:
   using Pivoted = Eigen::ColPivHouseholderQR<Matrix>;
-  bool basis();
-  Pivoted with_locked() const;  // J and the locked coordinates' rows, free of units, factorized
-  void basis_of(const Pivoted& qr);
-  void choose(const Indices& free);
-  void follow(In v);
-  void assemble(In v);
+  bool find_basis();
+  Pivoted factorize_with_locked_rows() const;  // J with rows for the locked coordinates, dimensionless
+  void set_basis_from(const Pivoted& qr);
+  void choose_coordinates(const Indices& free);
+  void compute_velocity_dependence(In v);
+  void assemble_A_B(In v);
 
-  Matrix u_by_q_, u_by_v_, opened_;
-  Vector force_, given_, residual_;
-  bool own_ = false;  // T is rho
+  Matrix rate_by_q_;
+  AppliedForce force_;
+  Vector constant_force_, residual_;
+  bool uses_rho_ = false;  // whether T is rho
 };
 
 }  // namespace ckc

@@ -14,53 +14,53 @@ Matrix columns_of(const Matrix& a, const Indices& at) {
   return part;
 }
 
-// The first columns that pivoting takes, as they are numbered in `at`.
-void take(const Matrix& a, const Indices& at, int count, Indices& z) {
+// Append the first columns that pivoting selects, numbered as in `at`.
+void append_pivot_columns(const Matrix& a, const Indices& at, int count, Indices& z) {
   const Eigen::ColPivHouseholderQR<Matrix> qr(a);
   for (int k = 0; k < count; ++k) z.push_back(at[qr.colsPermutation().indices()(k)]);
 }
 
-// A free root's coordinates are dependent as a whole where the loops determine them, else independent as a whole.
-bool choose(const Core& core, const Matrix& J, Indices& z) {
-  Indices inside, rest;
-  std::vector<bool> rooted(core.n, false);
+// The coordinates of a free root are dependent as a whole if the loops determine them, else independent as a whole.
+bool choose_dependent(const Core& core, const Matrix& J, Indices& z) {
+  Indices root_coordinates, other_coordinates;
+  std::vector<bool> is_root(core.n, false);
   for (const auto& root : core.tree.roots)
-    for (int k = root.v; k < root.v + 6; ++k) rooted[k] = true;
-  for (int k = 0; k < core.n; ++k) (rooted[k] ? inside : rest).push_back(k);
-  const int within = static_cast<int>(inside.size());
-  if (within && within <= std::min<int>(core.rank, static_cast<int>(J.rows()))) {
-    const Matrix block = columns_of(J, inside);
+    for (int k = root.v; k < root.v + 6; ++k) is_root[k] = true;
+  for (int k = 0; k < core.n; ++k) (is_root[k] ? root_coordinates : other_coordinates).push_back(k);
+  const int root_count = static_cast<int>(root_coordinates.size());
+  if (root_count && root_count <= std::min<int>(core.rank, static_cast<int>(J.rows()))) {
+    const Matrix block = columns_of(J, root_coordinates);
     const Eigen::ColPivHouseholderQR<Matrix> qr(block);
     const auto pivots = qr.matrixQR().diagonal().cwiseAbs();
-    if (pivots(within - 1) > core.scales.rank * pivots(0)) {
-      const Matrix basis = qr.householderQ() * Matrix::Identity(J.rows(), within);
-      Matrix left = columns_of(J, rest);
-      left -= basis * (basis.transpose() * left);
-      z = inside;
-      take(left, rest, core.rank - within, z);
+    if (pivots(root_count - 1) > core.scales.rank * pivots(0)) {
+      const Matrix basis = qr.householderQ() * Matrix::Identity(J.rows(), root_count);
+      Matrix projected = columns_of(J, other_coordinates);
+      projected -= basis * (basis.transpose() * projected);
+      z = root_coordinates;
+      append_pivot_columns(projected, other_coordinates, core.rank - root_count, z);
       return true;
     }
   }
-  const Matrix free = columns_of(J, rest);
-  if (within) {
+  const Matrix free = columns_of(J, other_coordinates);
+  if (root_count) {
     const Eigen::JacobiSVD<Matrix> svd(free);
     const auto& values = svd.singularValues();
     if (values.size() < core.rank || !(values(core.rank - 1) > core.scales.rank * values(0))) return false;
   }
-  take(free, rest, core.rank, z);
+  append_pivot_columns(free, other_coordinates, core.rank, z);
   return true;
 }
 
 }  // namespace
 
-bool best_partition(Core& core, Partition& found) {
-  core.jacobian();
-  found = {};
-  const Matrix J = core.scales.rows.asDiagonal() * core.rows.J * core.scales.columns.asDiagonal();
-  if (core.rank && !choose(core, J, found.z)) return false;
-  std::sort(found.z.begin(), found.z.end());
+bool find_best_partition(Core& core, Partition& best) {
+  core.compute_J();
+  best = {};
+  const Matrix J = core.scales.rows.asDiagonal() * core.constraints.J * core.scales.columns.asDiagonal();
+  if (core.rank && !choose_dependent(core, J, best.z)) return false;
+  std::sort(best.z.begin(), best.z.end());
   for (int k = 0; k < core.n; ++k)
-    if (!std::binary_search(found.z.begin(), found.z.end(), k)) found.q.push_back(k);
+    if (!std::binary_search(best.z.begin(), best.z.end(), k)) best.q.push_back(k);
   return true;
 }
 

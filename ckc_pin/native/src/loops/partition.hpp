@@ -1,4 +1,4 @@
-// Which coordinates serve as q: those whose z the loops determine best, by a pivoted factorization.
+// Choice of the partition q' = [q; z] by a pivoted factorization.
 #pragma once
 
 #include "loops/core.hpp"
@@ -9,7 +9,8 @@ struct Partition {
   Indices q, z;
 };
 
-// The split whose phi_z is furthest from singular where the core is; none where it would split a free root.
-bool best_partition(Core& core, Partition& found);
+// Find the partition whose phi_z is best conditioned at the core's configuration. False if it would split a free
+// root.
+bool find_best_partition(Core& core, Partition& best);
 
 }  // namespace ckc

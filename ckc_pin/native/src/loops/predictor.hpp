@@ -1,8 +1,8 @@
-// Where a motion has been on its level sets, and where z will be next.
+// Predicts z from the last points of a motion on its level sets, as the initial guess of the projection.
 //
-// phi(q, z) = w makes z a function of (q, w) with the known slopes rho_z and phi_z^-1. Newton's method needs fewer
-// iterations the better z is predicted: to first order from the nearest point visited, and along the motion, which is
-// smooth in t, by Hermite interpolation through the last points and their rates.
+// phi(q, z) = w makes z a function of (q, w) with the known derivatives rho_z and phi_z^-1. The prediction is of
+// first order from the nearest point. Along the motion, which is smooth in t, the last points and their rates are
+// interpolated by Hermite polynomials.
 #pragma once
 
 #include "loops/chart.hpp"
@@ -13,34 +13,36 @@ class Predictor {
  public:
   Predictor(const Core& core, double epsilon);
 
-  void start(const Core& core, In q_tree);  // forget; the first prediction is made from there
-  // Take note of the core's configuration, closed on the level set w; the former one at t is lost.
+  void reset(const Core& core, In q_tree);  // forget all points; the first prediction starts there
+  // Store the core's configuration, which is on the level set w. It replaces the point at the same t.
   void add(double t, const Core& core, In q_tree, In v_tree, In w);
-  // The configuration at q, `numbers` in a chart, with z as the points foretell it.
+  // Predict the configuration at q, given by its `numbers` in a chart.
   void predict(double t, In numbers, const Chart& chart, const Core& core, In w, Out q_tree);
 
  private:
-  static constexpr int kept = 8, nodes = 3;  // points; those of the interpolation, which is then of degree 5
-  static constexpr double largest_weight = 1e3;  // sum of the weights' sizes: beyond, the points' errors are magnified
-  static constexpr double resolved = 3.0;        // of epsilon: over longer times w's rate foretells nothing
+  // points stored; points interpolated, with polynomials of degree 5
+  static constexpr int max_points = 8, max_nodes = 3;
+  // largest sum of |weights|; larger weights would magnify the points' errors
+  static constexpr double largest_weight = 1e3;
+  static constexpr double max_time_constants = 3.0;  // of epsilon: over longer times the rate of w predicts nothing
 
   struct Point {
     double t = 0;
     Vector q_tree, v_tree, w;
     Matrix rho;
     Factor phi_z;
-    bool level = false;  // w is not zero
+    bool is_off_manifold = false;  // w is not zero
   };
 
-  void foretold(const Point& base, int count, const int* chosen, const double* a, const double* b, const Core& core);
-  double missed(const Core& core) const;
-  int foretelling(double t, int nearest, int* chosen, double* a, double* b) const;
+  void interpolate(const Point& base, int count, const int* chosen, const double* a, const double* b, const Core& core);
+  double prediction_error(const Core& core) const;
+  int choose_points(double t, int nearest, int* chosen, double* a, double* b) const;
 
   double epsilon_;
-  Point points_[kept + 1];  // the last one is where it starts
-  int count_ = 0, last_ = kept;
-  bool off_ = false;
-  Vector dq_, far_, level_, z_, step_, part_;
+  Point points_[max_points + 1];  // the last one is the starting point
+  int count_ = 0, last_point_ = max_points;
+  bool visited_level_sets_ = false;
+  Vector dq_, distance_step_, w_change_, z_, step_, difference_;
 };
 
 // Weights with p(t) = sum of a_i p(t_i) + b_i p'(t_i), exact for polynomials of degree 2 count - 1.

@@ -1,4 +1,4 @@
-// Which terms were evaluated, how often and for how long, for who asks.
+// Optional profile: how often each term was evaluated, and for how long.
 #pragma once
 
 #include <array>
@@ -14,7 +14,7 @@ struct Profile {
   std::array<long, terms> calls{};
   std::array<double, terms> seconds{};
 
-  // Books one evaluation for as long as it lives.
+  // Times one evaluation from construction to destruction.
   class Entry {
    public:
     Entry(Profile& profile, Term term) : profile_(profile.on ? &profile : nullptr), term_(term) {

@@ -10,16 +10,16 @@ namespace ckc {
 
 namespace {
 
-Vector6 force(const Vector3& at, const Vector3& along) {
+Vector6 force(const Vector3& at, const Vector3& direction) {
   Vector6 w;
-  w << along, at.cross(along);
+  w << direction, at.cross(direction);
   return w;
 }
 
-// The rate of `force`.
-Vector6 force_rate(const Vector3& at, const Vector3& along, const Vector3& at_dot, const Vector3& along_dot) {
+// Time derivative of `force`.
+Vector6 force_rate(const Vector3& at, const Vector3& direction, const Vector3& at_dot, const Vector3& direction_dot) {
   Vector6 w;
-  w << along_dot, at_dot.cross(along) + at.cross(along_dot);
+  w << direction_dot, at_dot.cross(direction) + at.cross(direction_dot);
   return w;
 }
 
@@ -31,10 +31,10 @@ Vector6 torque(const Vector3& about) {
 
 }  // namespace
 
-Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
+ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::move(table)) {
   const Closure& c = closure;
-  pairs_ = static_cast<int>(c.point_joint.size()) / 2;
-  p_.resize(2 * pairs_), p_dot_.resize(2 * pairs_), r_.resize(pairs_), r_dot_.resize(pairs_);
+  pair_count_ = static_cast<int>(c.point_joint.size()) / 2;
+  p_.resize(2 * pair_count_), p_dot_.resize(2 * pair_count_), r_.resize(pair_count_), r_dot_.resize(pair_count_);
   e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
   velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
   wrenches_.resize(c.rows), pattern.resize(c.rows);
@@ -42,9 +42,9 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
     for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
   };
   for (const auto& row : c.components)
-    joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair], c.direction_joint[row.direction]});
+    joints(row.out, {c.point_joint[row.pair], c.point_joint[pair_count_ + row.pair], c.direction_joint[row.direction]});
   for (const auto& row : c.dots) joints(row.out, {c.direction_joint[row.a], c.direction_joint[row.b]});
-  for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pairs_ + row.pair]});
+  for (const auto& row : c.distances) joints(row.out, {c.point_joint[row.pair], c.point_joint[pair_count_ + row.pair]});
   for (const auto& rows : c.logs)
     for (int out : rows.out) joints(out, {rows.joint_a, rows.joint_b});
   std::set<int> used(c.point_joint.begin(), c.point_joint.end());
@@ -66,30 +66,31 @@ Rows::Rows(const Tree& tree, Closure given) : closure(std::move(given)) {
   }
 }
 
-void Rows::vary(Number what, In numbers) {
-  if (what == Number::point)
+void ConstraintRows::set_parameters(Parameter what, In numbers) {
+  if (what == Parameter::point)
     for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = numbers.segment<3>(3 * k);
-  if (what == Number::length)
+  if (what == Parameter::length)
     for (auto& row : closure.distances) row.length = numbers(row.out);
   const auto n = J.cols();
   for (auto& row : closure.affine) {
-    if (what == Number::affine) row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
-    if (what == Number::affine_offset) row.offset = numbers(row.out);
+    if (what == Parameter::affine)
+      row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (what == Parameter::affine_offset) row.offset = numbers(row.out);
   }
 }
 
-void Rows::set(const Tree& tree, In q) {
+void ConstraintRows::update(const Tree& tree, In q) {
   const Closure& c = closure;
   for (size_t k = 0; k < p_.size(); ++k)
     p_[k] = tree.rotation(c.point_joint[k]) * c.point_local[k] + tree.translation(c.point_joint[k]);
-  for (int k = 0; k < pairs_; ++k) r_[k] = p_[k] - p_[pairs_ + k];
+  for (int k = 0; k < pair_count_; ++k) r_[k] = p_[k] - p_[pair_count_ + k];
   for (size_t k = 0; k < e_.size(); ++k) e_[k] = tree.rotation(c.direction_joint[k]) * c.direction_local[k];
   for (const auto& row : c.components) {
     const Vector3 &e = e_[row.direction], &r = r_[row.pair];
     auto& w = wrenches_[row.out];
     phi(row.out) = e.dot(r);
     w[0].w = force(p_[row.pair], e);
-    w[1].w = -force(p_[pairs_ + row.pair], e);
+    w[1].w = -force(p_[pair_count_ + row.pair], e);
     if (w[2].joint) w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
   }
   for (const auto& row : c.dots) {
@@ -99,26 +100,26 @@ void Rows::set(const Tree& tree, In q) {
     w[1].w = -w[0].w;
   }
   for (const auto& row : c.distances) {
-    const Vector3 along = r_[row.pair] / row.length;
+    const Vector3 direction = r_[row.pair] / row.length;
     auto& w = wrenches_[row.out];
     phi(row.out) = (r_[row.pair].squaredNorm() - row.length * row.length) / (2 * row.length);
-    w[0].w = force(p_[row.pair], along);
-    w[1].w = -force(p_[pairs_ + row.pair], along);
+    w[0].w = force(p_[row.pair], direction);
+    w[1].w = -force(p_[pair_count_ + row.pair], direction);
   }
   for (const auto& row : c.affine) {
     double value = -row.offset;
-    for (int j : pattern[row.out]) value += row.coefficients(j) * q(tree.place[j]);
+    for (int j : pattern[row.out]) value += row.coefficients(j) * q(tree.q_index[j]);
     phi(row.out) = value;
   }
-  relative(tree);
+  update_relative_rotations(tree);
 }
 
-void Rows::relative(const Tree& tree) {
+void ConstraintRows::update_relative_rotations(const Tree& tree) {
   for (const auto& rows : closure.logs) {
     const Matrix3 r_a = tree.rotation(rows.joint_a) * rows.rotation_a;
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
     const Vector3 u = log3(r_a.transpose() * r_b);
-    const Matrix3 m = LogRate(u).value * r_b.transpose();
+    const Matrix3 m = LogJacobian(u).value * r_b.transpose();
     for (int k = 0; k < 3; ++k) {
       auto& w = wrenches_[rows.out[k]];
       phi(rows.out[k]) = u(k);
@@ -128,18 +129,18 @@ void Rows::relative(const Tree& tree) {
   }
 }
 
-void Rows::rates(const Tree& tree) {
+void ConstraintRows::update_rates(const Tree& tree) {
   const Closure& c = closure;
-  for (int joint : joints_) velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.acceleration(joint);
+  for (int joint : joints_)
+    velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.bias_acceleration(joint);
   for (size_t k = 0; k < p_.size(); ++k) {
     const Vector6& v = velocity_[c.point_joint[k]];
     p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);
   }
-  for (int k = 0; k < pairs_; ++k) r_dot_[k] = p_dot_[k] - p_dot_[pairs_ + k];
-  for (size_t k = 0; k < e_.size(); ++k)
-    e_dot_[k] = Vector3(velocity_[c.direction_joint[k]].tail<3>()).cross(e_[k]);
+  for (int k = 0; k < pair_count_; ++k) r_dot_[k] = p_dot_[k] - p_dot_[pair_count_ + k];
+  for (size_t k = 0; k < e_.size(); ++k) e_dot_[k] = Vector3(velocity_[c.direction_joint[k]].tail<3>()).cross(e_[k]);
   for (const auto& row : c.components) {
-    const int a = row.pair, b = pairs_ + row.pair;
+    const int a = row.pair, b = pair_count_ + row.pair;
     const Vector3 &e = e_[row.direction], &e_dot = e_dot_[row.direction];
     auto& w = wrenches_[row.out];
     w[0].w_dot = force_rate(p_[a], e, p_dot_[a], e_dot);
@@ -152,26 +153,26 @@ void Rows::rates(const Tree& tree) {
     w[1].w_dot = -w[0].w_dot;
   }
   for (const auto& row : c.distances) {
-    const int a = row.pair, b = pairs_ + row.pair;
-    const Vector3 along = r_[row.pair] / row.length, along_dot = r_dot_[row.pair] / row.length;
+    const int a = row.pair, b = pair_count_ + row.pair;
+    const Vector3 direction = r_[row.pair] / row.length, direction_dot = r_dot_[row.pair] / row.length;
     auto& w = wrenches_[row.out];
-    w[0].w_dot = force_rate(p_[a], along, p_dot_[a], along_dot);
-    w[1].w_dot = -force_rate(p_[b], along, p_dot_[b], along_dot);
+    w[0].w_dot = force_rate(p_[a], direction, p_dot_[a], direction_dot);
+    w[1].w_dot = -force_rate(p_[b], direction, p_dot_[b], direction_dot);
   }
-  relative_rates(tree);
+  update_relative_rotation_rates(tree);
 }
 
-void Rows::relative_rates(const Tree& tree) {
+void ConstraintRows::update_relative_rotation_rates(const Tree& tree) {
   for (const auto& rows : closure.logs) {
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
     const Vector3 omega_b = velocity_[rows.joint_b].tail<3>();
     const Vector3 omega = omega_b - velocity_[rows.joint_a].tail<3>();
     Vector3 u;
     for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
-    const LogRate j_log(u);
+    const LogJacobian j_log(u);
     const Vector3 u_dot = j_log.value * (r_b.transpose() * omega);
     // d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
-    const Matrix3 m_dot = j_log.along(u_dot) * r_b.transpose() - j_log.value * r_b.transpose() * skew(omega_b);
+    const Matrix3 m_dot = j_log.derivative(u_dot) * r_b.transpose() - j_log.value * r_b.transpose() * skew(omega_b);
     for (int k = 0; k < 3; ++k) {
       auto& w = wrenches_[rows.out[k]];
       w[1].w_dot = torque(m_dot.row(k));
@@ -180,17 +181,17 @@ void Rows::relative_rates(const Tree& tree) {
   }
 }
 
-void Rows::jacobian(const Tree& tree) {
+void ConstraintRows::update_jacobian(const Tree& tree) {
   const Matrix6x& columns = tree.jacobian();
   for (int i = 0; i < closure.rows; ++i) {
-    if (wrenches_[i].empty()) continue;  // affine: it stays as it is
+    if (wrenches_[i].empty()) continue;  // affine rows have a constant Jacobian
     for (int j : pattern[i]) J(i, j) = 0.0;
     for (const auto& wrench : wrenches_[i])
       for (int j : tree.support[wrench.joint]) J(i, j) += wrench.w.dot(columns.col(j));
   }
 }
 
-void Rows::jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
+void ConstraintRows::update_jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
   const Matrix6x& columns = tree.jacobian();
   for (int i = 0; i < closure.rows; ++i) {
     for (int j : pattern[i]) J_dot(i, j) = 0.0;
@@ -200,7 +201,7 @@ void Rows::jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
   }
 }
 
-void Rows::bias(Out J_dot_v) const {
+void ConstraintRows::bias(Out J_dot_v) const {
   for (int i = 0; i < closure.rows; ++i) {
     double value = 0.0;
     for (const auto& wrench : wrenches_[i])
@@ -209,14 +210,14 @@ void Rows::bias(Out J_dot_v) const {
   }
 }
 
-std::vector<Indices> Rows::pattern_of(const Indices& columns, int n) const {
+std::vector<Indices> ConstraintRows::pattern_in(const Indices& columns, int n) const {
   Indices at(n, -1);
   for (size_t j = 0; j < columns.size(); ++j) at[columns[j]] = static_cast<int>(j);
-  std::vector<Indices> found(closure.rows);
+  std::vector<Indices> pattern_of_columns(closure.rows);
   for (int i = 0; i < closure.rows; ++i)
     for (int j : pattern[i])
-      if (at[j] >= 0) found[i].push_back(at[j]);
-  return found;
+      if (at[j] >= 0) pattern_of_columns[i].push_back(at[j]);
+  return pattern_of_columns;
 }
 
 }  // namespace ckc

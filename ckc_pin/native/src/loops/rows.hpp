@@ -1,19 +1,34 @@
-// The closure as the table of row primitives that Python uses, and springs' lengths.
+// The constraint rows of the loop closures, and their Jacobian. They are built from the same primitives as in Python
+// (`ckc_pin.mechanism.rows`): the step loop needs them without the interpreter.
 //
-// The derivative of every primitive is a sum over one to three joints of a wrench on the joint times the joint's
-// Jacobian, with wrench and Jacobian in world axes at the world's origin: J = sum of w . J_joint. So J, J_dot and
-// J_dot v are each written once.
+// The derivative of every primitive is a sum over one to three joints of a wrench times the joint's Jacobian, J = sum
+// of w . J_joint, both in world axes at the world's origin. J, J_dot and J_dot v then need one implementation each.
 #pragma once
 
 #include "tree/tree.hpp"
 
 namespace ckc {
 
-struct Component { int out, pair, direction; };
-struct Dot { int out, a, b; };
-struct Distance { int out, pair; double length; };
-struct Affine { int out; Vector coefficients; double offset; };
-struct RelativeLog { int out[3]; int joint_a, joint_b; Matrix3 rotation_a, rotation_b; };
+struct Component {
+  int out, pair, direction;
+};
+struct Dot {
+  int out, a, b;
+};
+struct Distance {
+  int out, pair;
+  double length;
+};
+struct Affine {
+  int out;
+  Vector coefficients;
+  double offset;
+};
+struct RelativeLog {
+  int out[3];
+  int joint_a, joint_b;
+  Matrix3 rotation_a, rotation_b;
+};
 
 struct Closure {
   int rows;
@@ -31,32 +46,33 @@ struct Wrench {
   Vector6 w, w_dot;
 };
 
-class Rows {
+class ConstraintRows {
  public:
-  Rows(const Tree& tree, Closure closure);
+  ConstraintRows(const Tree& tree, Closure closure);
 
   Closure closure;
-  std::vector<Indices> pattern;  // by row: the columns of J that are not zero
+  std::vector<Indices> pattern;  // by row: columns of J that are not zero
   Vector phi;                    // (rows)
   Matrix J, J_dot;               // (rows, n); zero outside the pattern
 
-  // Other numbers: points one after the other; of lengths, coefficients and offsets those of all rows.
-  enum class Number { point, length, affine, affine_offset };
-  void vary(Number what, In numbers);
-  std::vector<Indices> pattern_of(const Indices& columns, int n) const;  // of those of n columns, counted among them
-  void set(const Tree& tree, In q);  // phi and the wrenches, from the tree's placements
-  void jacobian(const Tree& tree);
-  void rates(const Tree& tree);      // the wrenches' rates, from the tree's velocities and accelerations
-  void jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
-  void bias(Out J_dot_v) const;      // after `rates`
+  // Replace one kind of parameter: points concatenated; lengths, coefficients and offsets of all rows.
+  enum class Parameter { point, length, affine, affine_offset };
+  void set_parameters(Parameter what, In numbers);
+  // the pattern restricted to `columns`, and numbered among them
+  std::vector<Indices> pattern_in(const Indices& columns, int n) const;
+  void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
+  void update_jacobian(const Tree& tree);
+  void update_rates(const Tree& tree);  // rates of the wrenches; requires the tree's velocities and accelerations
+  void update_jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
+  void bias(Out J_dot_v) const;  // requires update_rates
 
  private:
-  void relative(const Tree& tree);
-  void relative_rates(const Tree& tree);
+  void update_relative_rotations(const Tree& tree);
+  void update_relative_rotation_rates(const Tree& tree);
 
-  int pairs_;
+  int pair_count_;
   std::vector<Vector3> p_, r_, e_, p_dot_, r_dot_, e_dot_;
-  Indices joints_;  // joints that rows hold on to, and their motion
+  Indices joints_;  // joints that rows are attached to, and their motion
   std::vector<Vector6> velocity_, acceleration_;
   std::vector<std::vector<Wrench>> wrenches_;  // by row
 };

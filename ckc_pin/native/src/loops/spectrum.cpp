@@ -7,39 +7,41 @@
 
 namespace ckc {
 
-constexpr int small = 8;             // rows, up to which decomposing it whole is as cheap
-constexpr double exhausted = 1e-14;  // of the matrix' size: what the next direction is short of being one
-constexpr int first = 4;             // steps, after which it is looked whether they are enough; then after twice as many
-constexpr double exact = 1e-7;       // of the eigenvalue: what its vector may leave; its square is what the value is off by
+constexpr int max_dense_rows = 8;              // up to this size a dense decomposition is as cheap
+constexpr double breakdown_tolerance = 1e-14;  // of the matrix: below it the Krylov space is exhausted
+constexpr int first_check = 4;  // Lanczos steps before the first convergence check; checked again after twice as many
+// of the eigenvalue: residual of its vector; the error of the value is its square
+constexpr double residual_tolerance = 1e-7;
 
-// A vector that no symmetry of a mechanism is orthogonal to.
-static void along_nothing(Out u) {
+// A start vector that is not orthogonal to the smallest singular direction of a symmetric mechanism.
+static void fill_generic_vector(Out u) {
   for (Eigen::Index k = 0; k < u.size(); ++k) u(k) = 1.0 + 0.1 * static_cast<double>(k % 7);
 }
 
-Spectrum::Spectrum(std::vector<Indices> pattern, int columns, int rank) : pattern_(std::move(pattern)), rank_(rank) {
+SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int columns, int rank)
+    : pattern_(std::move(pattern)), rank_(rank) {
   const int m = static_cast<int>(pattern_.size());
-  whole_ = m <= small || rank < m;
+  is_dense_ = m <= max_dense_rows || rank < m;
   scaled_.setZero(m, columns), gram_.setZero(m, m), u_.setZero(m);
-  std::vector<Indices> meets(m);
+  std::vector<Indices> coupled_rows(m);
   for (int a = 0; a < m; ++a)
     for (int b = 0; b < m; ++b) {
       Indices columns_of_both;
       std::set_intersection(pattern_[a].begin(), pattern_[a].end(), pattern_[b].begin(), pattern_[b].end(),
                             std::back_inserter(columns_of_both));
       if (columns_of_both.empty()) continue;
-      meets[a].push_back(b);
+      coupled_rows[a].push_back(b);
       if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
     }
-  factor_.shape(m, m, whole_ ? full_pattern(m) : meets);
-  if (!whole_) basis_.setZero(m, steps_), next_.setZero(m), along_.setZero(steps_);
-  // Solvers cannot be copied before their first use.
-  const int size = whole_ ? std::max(m, 1) : 1;
+  factor_.shape(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
+  if (!is_dense_) basis_.setZero(m, max_steps_), next_.setZero(m), projections_.setZero(max_steps_);
+  // A solver that has computed nothing cannot be copied, so use it once.
+  const int size = is_dense_ ? std::max(m, 1) : 1;
   eigen_.compute(Matrix::Identity(size, size), Eigen::EigenvaluesOnly);
-  ritz_.compute(Eigen::Matrix<double, steps_, steps_>::Identity(), Eigen::EigenvaluesOnly);
+  ritz_.compute(Eigen::Matrix<double, max_steps_, max_steps_>::Identity(), Eigen::EigenvaluesOnly);
 }
 
-void Spectrum::compute(const Matrix& a, In row_scale, In column_scale) {
+void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_scale) {
   for (size_t i = 0; i < pattern_.size(); ++i)
     for (int j : pattern_[i]) scaled_(i, j) = row_scale(i) * a(i, j) * column_scale(j);
   for (const Pair& pair : pairs_) {
@@ -47,57 +49,57 @@ void Spectrum::compute(const Matrix& a, In row_scale, In column_scale) {
     for (int j : pair.columns) sum += scaled_(pair.a, j) * scaled_(pair.b, j);
     gram_(pair.a, pair.b) = gram_(pair.b, pair.a) = sum;
   }
-  mean_ = gram_.trace() / rank_;
-  whole_ ? dense() : sparse();
+  mean_square_ = gram_.trace() / rank_;
+  is_dense_ ? compute_dense() : compute_sparse();
 }
 
-void Spectrum::dense() {
+void SmallestSingularValue::compute_dense() {
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
-  least_ = eigen_.eigenvalues()(gram_.rows() - rank_);
+  smallest_ = eigen_.eigenvalues()(gram_.rows() - rank_);
 }
 
-void Spectrum::sparse() {
+void SmallestSingularValue::compute_sparse() {
   factor_.compute(gram_);
-  least_ = factor_.singular() ? 0.0 : 1.0 / most_of_inverse();
+  smallest_ = factor_.singular() ? 0.0 : 1.0 / largest_eigenvalue_of_inverse();
 }
 
-// With full orthogonalization, twice, which a few steps can afford; its vector is u_.
-double Spectrum::most_of_inverse() {
-  along_nothing(u_);
+// Lanczos' method with full orthogonalization (twice), which is affordable for few steps. The vector is stored in u_.
+double SmallestSingularValue::largest_eigenvalue_of_inverse() {
+  fill_generic_vector(u_);
   u_.normalize();
   basis_.col(0) = u_;
-  for (int k = 0, look = first;; ++k) {
+  for (int k = 0, next_check = first_check;; ++k) {
     factor_.solve(basis_.col(k), next_);
     diagonal_(k) = basis_.col(k).dot(next_);
-    const auto known = basis_.leftCols(k + 1);
-    for (int twice = 0; twice < 2; ++twice) {
-      along_.head(k + 1).noalias() = known.transpose() * next_;
-      next_.noalias() -= known * along_.head(k + 1);
+    const auto basis = basis_.leftCols(k + 1);
+    for (int pass = 0; pass < 2; ++pass) {
+      projections_.head(k + 1).noalias() = basis.transpose() * next_;
+      next_.noalias() -= basis * projections_.head(k + 1);
     }
-    beside_(k) = next_.norm();
-    if (ended(k) || k + 1 == look) {
-      look *= 2;
-      ritz_.computeFromTridiagonal(diagonal_.head(k + 1), beside_.head(k));
+    off_diagonal_(k) = next_.norm();
+    if (has_ended(k) || k + 1 == next_check) {
+      next_check *= 2;
+      ritz_.computeFromTridiagonal(diagonal_.head(k + 1), off_diagonal_.head(k));
       const double value = ritz_.eigenvalues()(k);
       const auto vector = ritz_.eigenvectors().col(k);
-      if (ended(k) || beside_(k) * std::abs(vector(k)) <= exact * value) {
-        u_.noalias() = known * vector;
+      if (has_ended(k) || off_diagonal_(k) * std::abs(vector(k)) <= residual_tolerance * value) {
+        u_.noalias() = basis * vector;
         return value;
       }
     }
-    basis_.col(k + 1) = next_ / beside_(k);
+    basis_.col(k + 1) = next_ / off_diagonal_(k);
   }
 }
 
-bool Spectrum::ended(int k) const {
-  return k + 1 == steps_ || !(beside_(k) > exhausted * std::abs(diagonal_(0)));
+bool SmallestSingularValue::has_ended(int k) const {
+  return k + 1 == max_steps_ || !(off_diagonal_(k) > breakdown_tolerance * std::abs(diagonal_(0)));
 }
 
-void Spectrum::vectors(Vector& u, Vector& v) {
-  if (whole_) {  // inverse iteration: the shift is as good as the value
-    gram_.diagonal().array() -= least_ + 1e-12 * mean_;
+void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
+  if (is_dense_) {  // inverse iteration, shifted by the eigenvalue
+    gram_.diagonal().array() -= smallest_ + 1e-12 * mean_square_;
     factor_.compute(gram_);
-    along_nothing(u_);
+    fill_generic_vector(u_);
     for (int k = 0; k < 2; ++k) {
       factor_.solve(u_, u_);
       u_.normalize();

@@ -1,4 +1,4 @@
-// The least singular value of a wide matrix, few of whose entries are not zero, and how large they are.
+// Smallest singular value of a sparse wide matrix, relative to its size.
 #pragma once
 
 #include <algorithm>
@@ -10,43 +10,46 @@
 
 namespace ckc {
 
-// From A A^T, so the least one is exact to eps times the square of their ratio.
+// Smallest nonzero singular value of A, from the eigenvalues of A A^T. Its error is eps times the squared condition
+// number.
 //
-// A small matrix, or one that lacks rank, is decomposed whole. For a large one that costs its rows cubed; it has the
-// least eigenvalue looked for by Lanczos' method on the inverse of A A^T, whose factors are as sparse as the loops are.
-class Spectrum {
+// Small or rank-deficient matrices are decomposed densely, at a cost of rows cubed. For large ones, Lanczos' method
+// finds the largest eigenvalue of the inverse of A A^T, whose factors are as sparse as the loops.
+class SmallestSingularValue {
  public:
-  // The pattern by rows; `rank`: how many singular values are not zero whatever the state.
-  Spectrum(std::vector<Indices> pattern, int columns, int rank);
+  // `pattern`: nonzero columns by row. `rank`: number of singular values that are not zero at a regular state.
+  SmallestSingularValue(std::vector<Indices> pattern, int columns, int rank);
 
-  void compute(const Matrix& a, In row_scale, In column_scale);  // of the scaled matrix; not read outside the pattern
-  double mean() const { return std::sqrt(mean_); }  // the root of their mean square
-  double least() const { return std::sqrt(std::max(least_, 0.0)); }
-  // Singular vectors of the least: u of unit length, and v = A^T u, whose length is that value to rounding.
-  void vectors(Vector& u, Vector& v);
+  // scales rows and columns first; ignores entries outside the pattern
+  void compute(const Matrix& a, In row_scale, In column_scale);
+  double root_mean_square() const { return std::sqrt(mean_square_); }  // of the nonzero singular values
+  double value() const { return std::sqrt(std::max(smallest_, 0.0)); }
+  // Compute the singular vectors of the smallest singular value: u of unit length, and v = A^T u, whose length is
+  // that value.
+  void compute_vectors(Vector& u, Vector& v);
 
  private:
-  static constexpr int steps_ = 16;  // of Lanczos' method, at most
-  using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, steps_, steps_>;
+  static constexpr int max_steps_ = 16;  // of Lanczos' method
+  using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, max_steps_, max_steps_>;
 
-  void dense();
-  void sparse();
-  double most_of_inverse();  // its largest eigenvalue by Lanczos' method
-  bool ended(int k) const;   // whether no step can follow the k-th
+  void compute_dense();
+  void compute_sparse();
+  double largest_eigenvalue_of_inverse();  // by Lanczos' method
+  bool has_ended(int k) const;             // whether step k is the last possible one
 
-  struct Pair {  // of rows that meet common columns
+  struct Pair {  // two rows with common nonzero columns
     int a, b;
     Indices columns;
   };
   std::vector<Indices> pattern_;
   std::vector<Pair> pairs_;
   int rank_;
-  bool whole_;
-  double mean_ = 0.0, least_ = 0.0;
+  bool is_dense_;
+  double mean_square_ = 0.0, smallest_ = 0.0;
   Matrix scaled_, gram_, basis_;
-  Vector u_, next_, along_;
-  Eigen::Matrix<double, steps_, 1> diagonal_, beside_;  // of what Lanczos' method makes of the matrix
-  Eigen::SelfAdjointEigenSolver<Matrix> eigen_;  // values only: vectors would allocate
+  Vector u_, next_, projections_;
+  Eigen::Matrix<double, max_steps_, 1> diagonal_, off_diagonal_;  // of the tridiagonal matrix
+  Eigen::SelfAdjointEigenSolver<Matrix> eigen_;                   // values only: vectors would allocate
   Eigen::SelfAdjointEigenSolver<Small> ritz_;
   Factor factor_;
 };

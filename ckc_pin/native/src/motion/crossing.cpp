@@ -7,128 +7,141 @@
 
 namespace ckc {
 
-// Of the time to a crossing: one that is as much behind the end of the run is left alone; how well it has to be in the
-// middle of the step; the last step of Newton's method on it ahead of time, whose next one would be its square.
-constexpr double beyond = 0.3, centred = 0.04, foreseen = 0.01;
-constexpr double ahead = 0.1;  // of s: what is left of it at a crossing, the motion extrapolated
-constexpr int most_attempts = 6, newton = 10, places = 9;
-constexpr int bits_ahead = 8, bits_within = 24;  // how closely the least value is looked for
-constexpr double lost = RankMonitor::lost, none = std::numeric_limits<double>::quiet_NaN();
+// Relative to the time to a crossing: how far it may lie behind the end of the run to be passed; how far it may be
+// from the middle of the step; when Newton's method for it, ahead of time, has converged.
+constexpr double max_time_past_end = 0.3, max_centre_error = 0.04, newton_time_tolerance = 0.01;
+constexpr double max_remaining_singular_value = 0.1;  // of the present singular value: at the extrapolated crossing
+constexpr int max_attempts = 6, max_newton_steps = 10, manifold_checks = 9;
+// bits of accuracy in the search for the smallest singular value
+constexpr int ahead_search_bits = 8, step_search_bits = 24;
+constexpr double rank_lost = RankMonitor::rank_lost, not_found = std::numeric_limits<double>::quiet_NaN();
 
 Crossing::Crossing(System& system, Method*& method, Step& step, RankMonitor& monitor,
-                   std::unique_ptr<Collocation> collocation_, double closed)
+                   std::unique_ptr<Collocation> collocation_, double manifold_tolerance)
     : collocation(std::move(collocation_)),
       system_(system),
       method_(method),
       step_(step),
       monitor_(monitor),
-      closed_(closed) {
+      manifold_tolerance_(manifold_tolerance) {
   y_.setZero(system.size);
-  begin();
+  reset();
 }
 
-void Crossing::begin() { inside_ = none, reach_ = std::numeric_limits<double>::infinity(), attempts_ = 0; }
+void Crossing::reset() {
+  crossing_in_rejected_step_ = not_found, max_distance_ = std::numeric_limits<double>::infinity(), attempts_ = 0;
+}
 
-bool Crossing::passes() const { return collocation && attempts_ < most_attempts; }
+bool Crossing::may_pass() const { return collocation && attempts_ < max_attempts; }
 
-double Crossing::left(const Rank& end, double length, double t_bound) {
-  const double t = step_.t, inside = std::exchange(inside_, none);
-  if (std::isfinite(inside)) return inside - t;
-  if (!passes() || !RankMonitor::ahead(end, length)) return none;
+double Crossing::time_to_crossing(const Rank& end, double step_size, double t_bound) {
+  const double t = step_.t, crossing = std::exchange(crossing_in_rejected_step_, not_found);
+  if (std::isfinite(crossing)) return crossing - t;
+  if (!may_pass() || !RankMonitor::may_lose_rank_ahead(end, step_size)) return not_found;
   Core& core = system_.core;
   const int nq = core.tree.nq;
-  const auto extrapolated = [&](double at) {  // as it accelerates now
+  const auto extrapolate = [&](double at) {  // with constant acceleration
     const double h = at - t;
     y_ = step_.y + h * step_.f;
     if (nq == core.n) y_.head(nq) += (0.5 * h * h) * step_.f.tail(core.n);
   };
-  const auto place = [&](double at) { return extrapolated(at), system_.place(y_); };
-  const double tangent = end.value / -end.rate, from = t + 0.3 * tangent, to = t + 1.3 * tangent;
-  RankMonitor::Least least{zero(extrapolated, t + tangent, foreseen * tangent), 0.0};
-  if (!(least.t > from && least.t < to)) least = monitor_.least(core, place, from, to, bits_ahead);
-  return least.value >= ahead * end.value || least.t - t_bound > beyond * (least.t - t) ? none : least.t - t;
+  const auto set_extrapolated = [&](double at) { return extrapolate(at), system_.set_core_configuration(y_); };
+  const double linear_time = end.value / -end.rate, from = t + 0.3 * linear_time, to = t + 1.3 * linear_time;
+  RankMonitor::Minimum minimum{find_zero(extrapolate, t + linear_time, newton_time_tolerance * linear_time), 0.0};
+  if (!(minimum.t > from && minimum.t < to))
+    minimum = monitor_.find_minimum(core, set_extrapolated, from, to, ahead_search_bits);
+  return minimum.value >= max_remaining_singular_value * end.value ||
+                 minimum.t - t_bound > max_time_past_end * (minimum.t - t)
+             ? not_found
+             : minimum.t - t;
 }
 
-Crossing::Verdict Crossing::judge(const Rank& end, const Rank& after) {
-  const double h = step_.t_new - step_.t, part = RankMonitor::part(end, after, h);
-  if (std::isnan(part)) {
-    const auto within = [&](double at) {
-      return method_->between(at, y_) && (system_.place(y_) || system_.exact(at, y_));
+Crossing::Verdict Crossing::judge_step(const Rank& end, const Rank& after) {
+  const double h = step_.t_new - step_.t, fraction = RankMonitor::step_fraction(end, after, h);
+  if (std::isnan(fraction)) {
+    const auto set_interpolated = [&](double at) {
+      return method_->interpolate(at, y_) && (system_.set_core_configuration(y_) || system_.sync_core(at, y_));
     };
-    const RankMonitor::Least least = monitor_.least(system_.core, within, step_.t, step_.t_new, bits_within);
-    if (least.value < lost) {
-      if (!passes()) return {0.0, true, least.t, least.value};
-      inside_ = least.t;
-      return {0.5 * (least.t - step_.t) / h};
+    const RankMonitor::Minimum minimum =
+        monitor_.find_minimum(system_.core, set_interpolated, step_.t, step_.t_new, step_search_bits);
+    if (minimum.value < rank_lost) {
+      if (!may_pass()) return {0.0, true, minimum.t, minimum.value};
+      crossing_in_rejected_step_ = minimum.t;
+      return {0.5 * (minimum.t - step_.t) / h};
     }
-    const double resolved = RankMonitor::part(end, after, h, least.value);
-    if (resolved < 1.0 || RankMonitor::kept(after)) return {resolved};
+    const double resolved_fraction = RankMonitor::step_fraction(end, after, h, minimum.value);
+    if (resolved_fraction < 1.0 || RankMonitor::has_rank(after)) return {resolved_fraction};
   }
-  if (!RankMonitor::kept(after) && !(part < 1.0)) {
-    if (!passes()) return {0.0, true, step_.t_new, after.value};
-    inside_ = step_.t_new;
+  if (!RankMonitor::has_rank(after) && !(fraction < 1.0)) {
+    if (!may_pass()) return {0.0, true, step_.t_new, after.value};
+    crossing_in_rejected_step_ = step_.t_new;
     return {0.5};
   }
-  return {std::isnan(part) ? 1.0 : part};
+  return {std::isnan(fraction) ? 1.0 : fraction};
 }
 
-double Crossing::over(double left, double length) {
-  double met = none;
-  if (left <= std::max(reach_, length)) {  // a step as long as the last one does not pass it either
-    const double crossing = step_.t + left;
+double Crossing::step_over(double time_left, double step_size) {
+  double crossed_at = not_found;
+  if (time_left <= std::max(max_distance_, step_size)) {  // a step as long as the last one would not pass it either
+    const double crossing = step_.t + time_left;
     ++attempts_;
-    if (left < 0.5 * length)  // so near J is ill-conditioned: rather from where the last step began
-      met = from(step_.t_old, step_.y_old, crossing);
-    if (!std::isfinite(met)) met = from(step_.t, step_.y, crossing);
+    if (time_left < 0.5 * step_size)  // J is too ill-conditioned here, so try from the start of the last step
+      crossed_at = step_from(step_.t_old, step_.y_old, crossing);
+    if (!std::isfinite(crossed_at)) crossed_at = step_from(step_.t, step_.y, crossing);
   }
-  if (std::isfinite(met)) {
+  if (std::isfinite(crossed_at)) {
     attempts_ = 0;
-  } else {  // let the next step end where one may succeed, unless it is to be shorter anyway
-    const double length = std::max(left - 0.9 * reach_, 0.1 * left);
-    if (step_.h > length) method_->forget(), step_.h = length;
+  } else {  // let the next step end where a crossing step may succeed
+    const double step_size = std::max(time_left - 0.9 * max_distance_, 0.1 * time_left);
+    if (step_.h > step_size) method_->reset_history(), step_.h = step_size;
   }
-  return met;
+  return crossed_at;
 }
 
-// Step from (t, y) with the crossing in the middle; when exactly it was met, NaN if it was not.
-double Crossing::from(double t, In y, double crossing) {
+// Step from (t, y) with the crossing in the middle. Returns the exact time of the crossing, NaN if the step fails.
+double Crossing::step_from(double t, In y, double crossing) {
   for (int k = 0; k < 2; ++k) {
-    const double left = crossing - t;
-    collocation->make(t, y, 2 * left, k > 0);
-    reach_ = left * std::clamp(collocation->scale(), 0.25, 2.0);
-    if (!collocation->good()) break;
-    const double when = zero([&](double at) { collocation->at(at, y_); }, crossing, 0.0), middle = (when - t) / left;
-    if (!(middle > 0.5 && middle < 1.5) || !closed()) break;
-    if (std::abs(when - crossing) < centred * left) return when;
-    crossing = when;
+    const double remaining = crossing - t;
+    collocation->make_step(t, y, 2 * remaining, k > 0);
+    max_distance_ = remaining * std::clamp(collocation->step_scale(), 0.25, 2.0);
+    if (!collocation->is_accurate()) break;
+    const double crossed_at = find_zero([&](double at) { collocation->evaluate(at, y_); }, crossing, 0.0),
+                 middle = (crossed_at - t) / remaining;
+    if (!(middle > 0.5 && middle < 1.5) || !is_on_manifold()) break;
+    if (std::abs(crossed_at - crossing) < max_centre_error * remaining) return crossed_at;
+    crossing = crossed_at;
   }
-  return none;
+  return not_found;
 }
 
-// By Newton's method: with its sign the value is smooth there, on both sides it over its rate is what is left.
+// Newton's method. With a sign the singular value is smooth at the crossing, so value / rate is the remaining time on
+// both sides.
 template <class Motion>
-double Crossing::zero(const Motion& motion, double t, double accuracy) {
+double Crossing::find_zero(const Motion& motion, double t, double accuracy) {
   double value = std::numeric_limits<double>::infinity();
-  for (int k = 0; k < newton; ++k) {
+  for (int k = 0; k < max_newton_steps; ++k) {
     motion(t);
-    if (!y_.allFinite() || !system_.at_last(t, y_)) return none;
-    const double before = value;
-    const Rank found = monitor_.at(system_);
-    value = found.value;
-    if (value <= 1e-3 * lost) return t;
-    if (!(value < 0.5 * before) || found.rate == 0.0) break;
-    const double step = value / found.rate;
+    if (!y_.allFinite() || !system_.sync_core_at_last_rhs(t, y_)) return not_found;
+    const double previous_value = value;
+    const Rank rank = monitor_.evaluate(system_);
+    value = rank.value;
+    if (value <= 1e-3 * rank_lost) return t;
+    if (!(value < 0.5 * previous_value) || rank.rate == 0.0) break;
+    const double step = value / rank.rate;
     t -= step;
     if (std::abs(step) <= accuracy) return t;
   }
-  return value <= lost ? t : none;
+  return value <= rank_lost ? t : not_found;
 }
 
-// Whether the branches meet: off the closure the step would have jumped a narrow gap between them.
-bool Crossing::closed() {
-  for (int k = 0; k < places; ++k) {
-    collocation->at(collocation->t_old + (collocation->t - collocation->t_old) * k / (places - 1), y_);
-    if (!system_.place(y_) || system_.core.rows.phi.lpNorm<Eigen::Infinity>() > closed_) return false;
+// Whether the step stays on the constraint manifold. If it does not, it may have jumped over a narrow gap between
+// branches.
+bool Crossing::is_on_manifold() {
+  for (int k = 0; k < manifold_checks; ++k) {
+    collocation->evaluate(collocation->t_old + (collocation->t - collocation->t_old) * k / (manifold_checks - 1), y_);
+    if (!system_.set_core_configuration(y_) ||
+        system_.core.constraints.phi.lpNorm<Eigen::Infinity>() > manifold_tolerance_)
+      return false;
   }
   return true;
 }

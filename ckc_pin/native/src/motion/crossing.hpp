@@ -1,5 +1,5 @@
-// Positions where J loses rank: seen within steps and ahead of them, passed by a collocation step where the formulation
-// does not need the branch from J, or reported as the end of the run.
+// Singular positions, where J loses rank: they are detected within steps and ahead of them. If the formulation
+// allows, a collocation step crosses them. Otherwise they end the run.
 #pragma once
 
 #include <memory>
@@ -13,47 +13,48 @@ class Crossing {
  public:
   using Rank = RankMonitor::Rank;
 
-  // `collocation`: null where no position is passed; `closed`: how closed the loops stay along a collocation step.
+  // `collocation`: null if singular positions are not crossed. `manifold_tolerance`: largest |phi| along a
+  // collocation step.
   Crossing(System& system, Method*& method, Step& step, RankMonitor& monitor, std::unique_ptr<Collocation> collocation,
-           double closed);
+           double manifold_tolerance);
 
-  void begin();  // from a state that something else came to
-  // Learn when J is about to lose rank.
-  void expect(double t) { inside_ = t; }
-  // Time until J loses rank, for a step that ended in `end`; NaN when that is not near. Costs no right-hand side.
-  double left(const Rank& end, double length, double t_bound);
+  void reset();  // after a discontinuity
+  // Announce a time at which J loses rank.
+  void expect_at(double t) { crossing_in_rejected_step_ = t; }
+  // Time until J loses rank, after a step that ended in `end`; NaN if that is not near. Needs no right-hand side.
+  double time_to_crossing(const Rank& end, double step_size, double t_bound);
 
   struct Verdict {
-    double part;               // of the step to make: 1 where it stands, less where a shorter one is to be tried
-    bool lost = false;         // J loses rank in it, and that cannot be passed:
-    double t = 0, value = 0;   // when, and its least singular value there
+    double fraction;          // of the step to make: 1 to accept it, less to retry with a shorter one
+    bool rank_lost = false;   // J loses rank within the step, and that cannot be crossed
+    double t = 0, value = 0;  // its time, and the smallest singular value there
   };
-  Verdict judge(const Rank& end, const Rank& after);
-  // Step over a crossing; when J lost rank, NaN where it has to be approached first: the method's next step is as long
-  // as that asks then.
-  double over(double left, double length);
-  // Learn of a step that was kept.
-  void kept(const Rank& after) {
+  Verdict judge_step(const Rank& end, const Rank& after);
+  // Step over a crossing. Returns its time, or NaN if it has to be approached first; the method's next step size is
+  // set accordingly.
+  double step_over(double time_left, double step_size);
+  // Call after a step is accepted.
+  void accept_step(const Rank& after) {
     if (after.rate > 0.0) attempts_ = 0;
   }
 
   const std::unique_ptr<Collocation> collocation;
 
  private:
-  double from(double t, In y, double crossing);
-  // When J loses rank on a motion that sets y_, from t on; NaN where that is not found.
+  double step_from(double t, In y, double crossing);
+  // Find the time at which J loses rank on a motion that sets y_, starting from t. NaN if not found.
   template <class Motion>
-  double zero(const Motion& motion, double t, double accuracy);
-  bool closed();
-  bool passes() const;
+  double find_zero(const Motion& motion, double t, double accuracy);
+  bool is_on_manifold();
+  bool may_pass() const;
 
   System& system_;
   Method*& method_;
   Step& step_;
   RankMonitor& monitor_;
-  double closed_;
-  double inside_;  // within a step that was not kept; else NaN
-  double reach_;   // s; from farther away no collocation step is expected to be accurate
+  double manifold_tolerance_;
+  double crossing_in_rejected_step_;  // NaN if there is none
+  double max_distance_;               // s; farther away no collocation step is expected to be accurate
   int attempts_ = 0;
   Vector y_;
 };

@@ -6,12 +6,12 @@
 
 namespace ckc {
 
-constexpr int most_steps = 10;
-constexpr double longer = 4.0;       // times: next to where phi_z is singular, z alone has far to go
-constexpr double rounding = 2e-16;   // of a product: a velocity that is allowed to the last digit stays what it is
-constexpr double negligible = 1e-9;  // rad, or of the mechanism's size: Newton's last step onto the closure
+constexpr int max_newton_steps = 10;
+constexpr double max_z_step_ratio = 4.0;   // near a singular phi_z, steps of z alone become long
+constexpr double rounding = 2e-16;         // of a product: smaller velocity errors are left as they are
+constexpr double newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
 
-static double largest(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
+static double largest_entry(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
 
 Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double alpha, double beta)
     : System(core_, control_, core_.tree.nq + core_.n),
@@ -19,243 +19,255 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       alpha_(alpha),
       beta_(beta),
       projects_(projects) {
-  crosses = projects;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), unforced_.setZero(core.n), residual_.setZero(core.rows.closure.rows);
+  crosses_singularities = projects;
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), no_force_.setZero(core.n),
+      residual_.setZero(core.constraints.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) {
-  elimination.start(core);
+  elimination.reset(core);
   y << q_tree, v;
 }
 
-void Dae::set(In q_tree, bool with_inertia) {
-  core.set(q_tree, with_inertia);
-  core.jacobian();
-  placed_ = with_inertia ? core.sets : -1;
+void Dae::set_core(In q_tree, bool with_inertia) {
+  core.set_configuration(q_tree, with_inertia);
+  core.compute_J();
+  core_configuration_ = with_inertia ? core.configuration_count : -1;
 }
 
-// Unless the core was left there.
-bool Dae::place(In y) {
+// Keep the core if it is already there.
+bool Dae::set_core_configuration(In y) {
   q_tree_ = y.head(core.tree.nq);
   if (!q_tree_.allFinite()) return false;
-  if (placed_ == core.sets && q_tree_ == core.q_tree) return true;  // though to normalise it again may change a digit
+  // normalizing again could change the last digit
+  if (core_configuration_ == core.configuration_count && q_tree_ == core.q_tree) return true;
   core.tree.normalize(q_tree_);
-  if (placed_ != core.sets || q_tree_ != core.q_tree) set(q_tree_);
+  if (core_configuration_ != core.configuration_count || q_tree_ != core.q_tree) set_core(q_tree_);
   return true;
 }
 
 bool Dae::rhs(double t, In y, Out y_dot) {
-  if (!finite(y)) return fails(Trouble::infinite);
+  if (!finite(y)) return fail(RhsFailure::not_finite);
   const auto v = y.tail(core.n);
-  if (core.written && core.joints.locked.empty() && !control.needs_terms() && !stabilised()) {  // no term but the acceleration is needed
+  // only the acceleration is needed
+  if (core.compiled && core.joints.locked.empty() && !control.needs_terms() && !is_stabilized()) {
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
-    const bool acts = control.acts() || core.joints.acts();
-    if (acts && !forces(t, q_tree_, v)) return false;
-    if (core.written_acceleration(q_tree_, v, acts ? acting(v) : unforced_, uncorrected_, y_dot.tail(core.n))) {
+    const bool acts = control.is_active() || core.joints.exerts_force();
+    if (acts && !compute_forces(t, q_tree_, v)) return false;
+    if (core.compiled_acceleration(q_tree_, v, acts ? applied_force(v) : no_force_, zero_correction_,
+                                   y_dot.tail(core.n))) {
       counts.factorizations += 2;
       core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
-      return finite(y_dot) || fails(Trouble::infinite);
+      return finite(y_dot) || fail(RhsFailure::not_finite);
     }
-    ++counts.pivoted;
-  } else if (core.written && !core.written->eliminates()) {
-    ++counts.pivoted;
+    ++counts.general_rhs;
+  } else if (core.compiled && !core.compiled->allows_elimination()) {
+    ++counts.general_rhs;
   }
-  place(y);
-  return rate(t, v, y_dot);
+  set_core_configuration(y);
+  return evaluate_rate(t, v, y_dot);
 }
 
-bool Dae::forces(double t, In q_tree, In v) {
-  independent(q_tree, v);
+bool Dae::compute_forces(double t, In q_tree, In v) {
+  set_q_and_q_dot(q_tree, v);
   v_tree = v;
-  return act(t);
+  return compute_control(t);
 }
 
-void Dae::independent(In q_tree, In v) {
-  for (int k = 0; k < core.d; ++k) q(k) = q_tree(core.tree.place[core.q[k]]), q_dot(k) = v(core.q[k]);
+void Dae::set_q_and_q_dot(In q_tree, In v) {
+  for (int k = 0; k < core.d; ++k) q(k) = q_tree(core.tree.q_index[core.q[k]]), q_dot(k) = v(core.q[k]);
 }
 
-bool Dae::rate(double t, In v, Out y_dot) {
+bool Dae::evaluate_rate(double t, In v, Out y_dot) {
   const int n = core.n;
   core.set_velocity(v);
-  if (!forces(t, core.q_tree, v)) return false;
+  if (!compute_forces(t, core.q_tree, v)) return false;
   residual_.setZero();
-  if (stabilised()) {
-    residual_.noalias() = core.rows.J * core.v_tree;
-    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
+  if (is_stabilized()) {
+    residual_.noalias() = core.constraints.J * core.v_tree;
+    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.constraints.phi;
   }
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
-  if (!eq_1(v, residual_, y_dot.tail(n))) return false;
-  return finite(y_dot) || fails(Trouble::infinite);
+  if (!acceleration_with_held_joints(v, residual_, y_dot.tail(n))) return false;
+  return finite(y_dot) || fail(RhsFailure::not_finite);
 }
 
-// In numbers: a free root's quaternion stands for the rotation that it is normalised to.
+// Derivatives with respect to the numbers of q'; a quaternion stands for the rotation of its normalized value.
 bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const int n = core.n, nq = core.tree.nq;
   if (!finite(y)) return false;
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
-  if (!core.written || !core.joints.locked.empty() || control.needs_terms() || stabilised()) place(y), core.set_velocity(v);
-  if (!forces(t, q_tree_, v)) return false;
+  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized())
+    set_core_configuration(y), core.set_velocity(v);
+  if (!compute_forces(t, q_tree_, v)) return false;
   residual_.setZero();
-  if (stabilised()) {
-    residual_.noalias() = core.rows.J * v;
-    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.rows.phi;
+  if (is_stabilized()) {
+    residual_.noalias() = core.constraints.J * v;
+    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.constraints.phi;
   }
-  if (!slopes(q_tree_, v, residual_, by_q_, by_v_)) return System::jacobian(t, y, jacobian, evaluations);
-  if (stabilised() && core.rows.closure.rows) {
-    Derivatives& by = core.derivatives;
-    by.compute(q_tree_, v, a_, uncorrected_);  // of the rows alone; terms written out have left none
+  if (!acceleration_derivatives(q_tree_, v, residual_)) return System::jacobian(t, y, jacobian, evaluations);
+  if (is_stabilized() && core.constraints.closure.rows) {
+    DynamicsDerivatives& by = core.derivatives;
+    by.compute(q_tree_, v, eq_1_.a, zero_correction_);  // for the constraint rows; compiled terms do not compute these
     const Matrix none = Matrix::Zero(n, n);
-    if (!core.respond(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, more_)) return false;
-    by_q_ += more_;
-    if (!core.respond(none, 2 * alpha_ * by.J, more_)) return false;
-    by_v_ += more_;
+    if (!core.solve_acceleration_derivatives(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, stabilization_))
+      return false;
+    eq_1_.by_q += stabilization_;
+    if (!core.solve_acceleration_derivatives(none, 2 * alpha_ * by.J, stabilization_)) return false;
+    eq_1_.by_v += stabilization_;
   }
   jacobian.setZero(nq + n, nq + n);
-  for (int k : core.tree.single) jacobian(core.tree.place[k], nq + k) = 1.0;
+  for (int k : core.tree.single_dof) jacobian(core.tree.q_index[k], nq + k) = 1.0;
   for (const Tree::Root& root : core.tree.roots)
-    for (int k = root.v; k < root.v + 6; ++k) core.tree.configuration_rate(q_tree_, Vector::Unit(n, k), jacobian.col(nq + k).head(nq));
-  jacobian.bottomRightCorner(n, n) = by_v_;
+    for (int k = root.v; k < root.v + 6; ++k)
+      core.tree.configuration_rate(q_tree_, Vector::Unit(n, k), jacobian.col(nq + k).head(nq));
+  jacobian.bottomRightCorner(n, n) = eq_1_.by_v;
   if (nq == n) {
-    jacobian.bottomLeftCorner(n, n) = by_q_;
+    jacobian.bottomLeftCorner(n, n) = eq_1_.by_q;
   } else {
-    const Matrix tangents = core.tree.tangents(y.head(nq));
-    jacobian.topLeftCorner(nq, nq) = core.tree.rate_changes(q_tree_, v) * tangents;
-    jacobian.bottomLeftCorner(n, nq) = by_q_ * tangents;
+    const Matrix tangents = core.tree.q_dot_to_tangent(y.head(nq));
+    jacobian.topLeftCorner(nq, nq) = core.tree.configuration_rate_derivative(q_tree_, v) * tangents;
+    jacobian.bottomLeftCorner(n, nq) = eq_1_.by_q * tangents;
   }
   return finite(jacobian.reshaped());
 }
 
-// Stiff control would answer to any change of what it sees: where one acts, z alone is moved, unless that takes steps
-// far longer than the loops need.
-bool Dae::closing_step(In residual) {
-  if (!core.closing_step(residual, step_)) return false;
-  if (!control.acts()) return true;
-  core.factor();
+// A stiff controller would respond to changes of the measured q. With a controller, only z is corrected, unless that
+// takes much longer steps.
+bool Dae::closure_step(In residual) {
+  if (!core.closure_step(residual, step_)) return false;
+  if (!control.is_active()) return true;
+  core.factorize_phi_z();
   if (core.phi_z.singular()) return true;
-  core.z_step(residual, z_step_);
+  core.closure_step_in_z(residual, z_step_);
   const Vector& units = core.scales.columns;
-  if (z_step_.cwiseQuotient(units).norm() < longer * step_.cwiseQuotient(units).norm()) step_ = z_step_;
+  if (z_step_.cwiseQuotient(units).norm() < max_z_step_ratio * step_.cwiseQuotient(units).norm()) step_ = z_step_;
   return true;
 }
 
-bool Dae::project(In y) {
+bool Dae::project_onto_manifold(In y) {
   const int n = core.n;
-  place(y);
-  const double tolerance = tolerance_ * core.coarseness();
-  for (int k = 0; largest(core.rows.phi) > tolerance; ++k) {
-    if (k == most_steps || !core.rows.phi.allFinite() || !closing_step(core.rows.phi)) return false;
+  set_core_configuration(y);
+  const double tolerance = tolerance_ * core.tolerance_scale();
+  for (int k = 0; largest_entry(core.constraints.phi) > tolerance; ++k) {
+    if (k == max_newton_steps || !core.constraints.phi.allFinite() || !closure_step(core.constraints.phi)) return false;
     ++counts.newton, counts.factorizations += 2;
-    residual_.noalias() = core.rows.J * step_;
+    residual_.noalias() = core.constraints.J * step_;
     core.tree.integrate(q_tree_, step_);
-    set(q_tree_);
-    if (largest(residual_) <= tolerance) break;  // what else remains, rows contradict
+    set_core(q_tree_);
+    if (largest_entry(residual_) <= tolerance) break;  // the remaining residual is a contradiction of redundant rows
   }
   velocity = y.tail(n);
-  residual_.noalias() = core.rows.J * velocity;
-  if (largest(residual_) <= rounding * core.rows.J.norm() * velocity.norm()) return true;
-  if (!closing_step(residual_)) return false;
+  residual_.noalias() = core.constraints.J * velocity;
+  if (largest_entry(residual_) <= rounding * core.constraints.J.norm() * velocity.norm()) return true;
+  if (!closure_step(residual_)) return false;
   velocity += step_;
   return velocity.allFinite();
 }
 
-bool Dae::rate_on_closure(double t, In y, Out y_dot) {
+bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
   const int n = core.n;
   if (!finite(y)) return false;
   q_tree_ = y.head(core.tree.nq);
   core.tree.normalize(q_tree_);
-  set(q_tree_, false);
+  set_core(q_tree_, false);
   for (int k = 0;; ++k) {
-    if (k == most_steps || !core.step_onto_closure(core.rows.phi, step_)) return false;
+    if (k == max_newton_steps || !core.cheapest_closure_step(core.constraints.phi, step_)) return false;
     ++counts.factorizations;
     core.tree.integrate(q_tree_, step_);
-    set(q_tree_);
-    if (largest(step_.cwiseQuotient(core.scales.columns)) <= negligible) break;  // what is left is its square
+    set_core(q_tree_);
+    // the remaining error is the square of this step
+    if (largest_entry(step_.cwiseQuotient(core.scales.columns)) <= newton_tolerance) break;
   }
-  residual_.noalias() = core.rows.J * y.tail(n);
-  if (!core.step_onto_closure(residual_, step_)) return false;
+  residual_.noalias() = core.constraints.J * y.tail(n);
+  if (!core.cheapest_closure_step(residual_, step_)) return false;
   ++counts.factorizations;
   velocity = y.tail(n) + step_;
-  return rate(t, velocity, y_dot);
+  return evaluate_rate(t, velocity, y_dot);
 }
 
-void Dae::rates(std::vector<std::pair<int, int>>& of) const {
+void Dae::rate_pairs(std::vector<std::pair<int, int>>& of) const {
   of.clear();
-  for (int k : core.tree.single) of.emplace_back(core.tree.place[k], core.tree.nq + k);
+  for (int k : core.tree.single_dof) of.emplace_back(core.tree.q_index[k], core.tree.nq + k);
 }
 
-// Along the velocities that the loops allow: across them nothing moves, whatever the Jacobian off the closure says.
-bool Dae::modes(In y, Matrix& jacobian) {
+// Restrict the Jacobian to the tangent space: no motion crosses the constraint manifold, whatever the Jacobian says
+// there.
+bool Dae::reduce_to_freedoms(In y, Matrix& jacobian) {
   const int n = core.n, nq = core.tree.nq, d = n - core.rank;
-  place(y);
-  const Matrix* tangent = core.tangent();
+  set_core_configuration(y);
+  const Matrix* tangent = core.compute_tangent_basis();
   if (!tangent) return false;
-  Matrix moves(nq, d), found = Matrix::Zero(2 * d, 2 * d);
-  for (int k = 0; k < d; ++k) core.tree.configuration_rate(q_tree_, tangent->col(k), moves.col(k));
-  const auto along = (tangent->transpose() * *tangent).ldlt();
-  found.topRightCorner(d, d).setIdentity();
-  found.bottomLeftCorner(d, d) = along.solve(tangent->transpose() * (jacobian.bottomLeftCorner(n, nq) * moves));
-  found.bottomRightCorner(d, d) = along.solve(tangent->transpose() * (jacobian.bottomRightCorner(n, n) * *tangent));
-  jacobian = found;
+  Matrix q_rates(nq, d), freedoms = Matrix::Zero(2 * d, 2 * d);
+  for (int k = 0; k < d; ++k) core.tree.configuration_rate(q_tree_, tangent->col(k), q_rates.col(k));
+  const auto gram = (tangent->transpose() * *tangent).ldlt();
+  freedoms.topRightCorner(d, d).setIdentity();
+  freedoms.bottomLeftCorner(d, d) = gram.solve(tangent->transpose() * (jacobian.bottomLeftCorner(n, nq) * q_rates));
+  freedoms.bottomRightCorner(d, d) = gram.solve(tangent->transpose() * (jacobian.bottomRightCorner(n, n) * *tangent));
+  jacobian = freedoms;
   return true;
 }
 
-bool Dae::exact(double, In y) {
+bool Dae::sync_core(double, In y) {
   const int n = core.n;
   if (projects_) {
-    if (!project(y)) return false;
+    if (!project_onto_manifold(y)) return false;
   } else {
-    place(y);
+    set_core_configuration(y);
     velocity = y.tail(n);
   }
   v_tree = velocity;
-  independent(core.q_tree, velocity);
+  set_q_and_q_dot(core.q_tree, velocity);
   return true;
 }
 
-bool Dae::at_start(double t, In y) {
-  if (!exact(t, y)) return false;
-  elimination.begin(core, v_tree);
+bool Dae::sync_core_at_start(double t, In y) {
+  if (!sync_core(t, y)) return false;
+  elimination.check_start(core, v_tree);
   return true;
 }
 
-bool Dae::at_last(double, In y) {
-  place(y);
+bool Dae::sync_core_at_last_rhs(double, In y) {
+  set_core_configuration(y);
   velocity = v_tree = y.tail(core.n);
-  if (elimination.is_due()) elimination.remember(core.q_tree, v_tree, acting(v_tree));
+  if (elimination.is_due()) elimination.remember_state(core.q_tree, v_tree, applied_force(v_tree));
   return true;
 }
 
-bool Dae::as_is(double, In y) {
-  if (!place(y)) return false;
+bool Dae::sync_core_unprojected(double, In y) {
+  if (!set_core_configuration(y)) return false;
   velocity = v_tree = y.segment(core.tree.nq, core.n);
-  independent(core.q_tree, velocity);
+  set_q_and_q_dot(core.q_tree, velocity);
   return true;
 }
 
-bool Dae::shows(In y, int k, bool rate, double& value) const {
+bool Dae::read_from_state(In y, int k, bool evaluate_rate, double& value) const {
   const int nq = core.tree.nq;
-  if (!rate && nq != core.n && !std::binary_search(core.tree.single.begin(), core.tree.single.end(), k)) return false;
-  return value = y(rate ? nq + k : core.tree.place[k]), true;
+  if (!evaluate_rate && nq != core.n &&
+      !std::binary_search(core.tree.single_dof.begin(), core.tree.single_dof.end(), k))
+    return false;
+  return value = y(evaluate_rate ? nq + k : core.tree.q_index[k]), true;
 }
 
-void Dae::put_exact(Out y) const {
+void Dae::write_projected_state(Out y) const {
   if (projects_) y.head(core.tree.nq) = core.q_tree, y.segment(core.tree.nq, core.n) = velocity;
 }
 
-Accepted Dae::accept(double, Out y, double) {
+Accepted Dae::accept_step(double, Out y, double) {
   const int n = core.n;
-  elimination.accept(core);
-  if (!projects_) return Accepted::kept;
-  place(y);
-  residual_.noalias() = core.rows.J * y.tail(n);
-  const double drift_rate = largest(residual_) / (1.0 + largest(y.tail(n)));
-  if (std::max(largest(core.rows.phi), drift_rate) <= tolerance_ * core.coarseness()) return Accepted::kept;
-  if (!project(y)) return Accepted::refused;
-  put_exact(y);
+  elimination.accept_step(core);
+  if (!projects_) return Accepted::unchanged;
+  set_core_configuration(y);
+  residual_.noalias() = core.constraints.J * y.tail(n);
+  const double drift_rate = largest_entry(residual_) / (1.0 + largest_entry(y.tail(n)));
+  if (std::max(largest_entry(core.constraints.phi), drift_rate) <= tolerance_ * core.tolerance_scale())
+    return Accepted::unchanged;
+  if (!project_onto_manifold(y)) return Accepted::rejected;
+  write_projected_state(y);
   return Accepted::changed;
 }
 

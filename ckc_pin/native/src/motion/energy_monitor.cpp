@@ -8,28 +8,28 @@ constexpr double rounding = 1e-13;  // of kinetic and potential energy
 
 double EnergyMonitor::energy(System& system) {
   Core& core = system.core;
-  const bool dissipates = core.springs.any_damping || core.joints.acts();
-  if (!system.conserves() || system.control.acts() || dissipates) return std::nan("");
+  const bool dissipates = core.springs.has_damping || core.joints.exerts_force();
+  if (!system.conserves_energy() || system.control.is_active() || dissipates) return std::nan("");
   const Energy energy = core.energy(system.velocity, momentum_);
   size_ = energy.kinetic + std::abs(energy.potential);
   return energy.total();
 }
 
-void EnergyMonitor::from(System& system) { from_ = to_ = energy(system); }
+void EnergyMonitor::start_step(System& system) { start_energy_ = end_energy_ = energy(system); }
 
-// A state within its tolerance is off by (atol + rtol |x|) in each number, and the energy by that times its gradient:
-// the momentum, and the forces, of which C'v' counts as one here.
-double EnergyMonitor::at(System& system, double rtol, double atol) {
-  to_ = energy(system);
-  if (std::isnan(from_) || std::isnan(to_)) return 0.0;
+// A state within its tolerance has errors atol + rtol |x|. The energy then has that error times its gradient: the
+// momentum, and the forces, which here include C'v'.
+double EnergyMonitor::relative_change(System& system, double rtol, double atol) {
+  end_energy_ = energy(system);
+  if (std::isnan(start_energy_) || std::isnan(end_energy_)) return 0.0;
   Core& core = system.core;
-  core.set_velocity(system.velocity), core.bias();
-  double allowed = rounding * size_;
+  core.set_velocity(system.velocity), core.compute_bias();
+  double allowance = rounding * size_;
   for (int k = 0; k < core.n; ++k)
-    allowed += std::abs(momentum_(k)) * (atol + rtol * std::abs(system.velocity(k))) +
-               std::abs(core.bias_tree(k)) * (atol + rtol * std::abs(core.q_tree(core.tree.place[k])));
-  change = to_ - from_;
-  return std::abs(change) / allowed;
+    allowance += std::abs(momentum_(k)) * (atol + rtol * std::abs(system.velocity(k))) +
+                 std::abs(core.bias_tree(k)) * (atol + rtol * std::abs(core.q_tree(core.tree.q_index[k])));
+  change = end_energy_ - start_energy_;
+  return std::abs(change) / allowance;
 }
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// What a step may change in the energy of a motion that conserves it.
+// Checks the energy change of a step of a conservative motion.
 #pragma once
 
 #include <cmath>
@@ -10,17 +10,17 @@ namespace ckc {
 class EnergyMonitor {
  public:
   explicit EnergyMonitor(const Core& core) { momentum_.setZero(core.n); }
-  // Take the energy where a step begins, at the core's state.
-  void from(System& system);
-  // By how many times its allowance a step to the core's state has changed it; zero where nothing conserves it.
-  // `rtol`, `atol`: of the step.
-  double at(System& system, double rtol, double atol);
-  void kept() { from_ = to_; }  // that step
-  double change = 0.0;  // J
+  // Store the energy at the start of a step, at the core's state.
+  void start_step(System& system);
+  // Energy change of a step to the core's state, relative to what the tolerances `rtol` and `atol` allow. Zero if the
+  // motion is not conservative.
+  double relative_change(System& system, double rtol, double atol);
+  void accept_step() { start_energy_ = end_energy_; }
+  double change = 0.0;  // J, of the last step
 
  private:
-  double energy(System& system);  // and momentum_
-  double from_ = std::nan(""), to_ = std::nan(""), size_ = 0.0;
+  double energy(System& system);  // also computes momentum_
+  double start_energy_ = std::nan(""), end_energy_ = std::nan(""), size_ = 0.0;
   Vector momentum_;
 };
 

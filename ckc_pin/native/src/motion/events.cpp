@@ -5,287 +5,301 @@
 
 namespace ckc {
 
-constexpr double place_rounding = 1e-15;  // rad, or of the mechanism's size
-constexpr double least_known = 1e-9;  // rad/s, m/s: a rate that is nearer to zero where a motion begins may be zero
-constexpr double time_tolerance = 2e-12;  // s: two functions that cross zero at once are found no further apart
+constexpr double coordinate_rounding = 1e-15;  // rad, or relative to the mechanism's size
+constexpr double min_known_rate = 1e-9;        // rad/s, m/s: smaller rates at the start of a motion count as zero
+constexpr double simultaneous_time_tolerance = 2e-12;  // s: computed times of simultaneous events differ by less
 
 Events::Events(System& system, Step& step, std::vector<Event> events)
-    : system_(system), step_(step), events_(std::move(events)), places_(walk_places()) {
+    : system_(system), step_(step), events_(std::move(events)), sample_points_(sample_points()) {
   const Core& core = system.core;
-  add_own();
+  add_joint_events();
   const auto count = static_cast<Eigen::Index>(events_.size());
   for (End* end : {&start_, &end_}) end->q.setZero(core.n), end->v.setZero(core.n), end->a.setZero(core.n);
-  walks_.resize(events_.size());
-  values_.setZero(places_.size(), count), y_.setZero(system.size), coordinates_.setZero(core.n);
-  begin();
+  searches_.resize(events_.size());
+  values_.setZero(sample_points_.size(), count), y_.setZero(system.size), coordinates_.setZero(core.n);
+  reset();
 }
 
-void Events::add_own() {
+void Events::add_joint_events() {
   const Joints& joints = system_.core.joints;
-  const auto add = [&](Event::Of of, int k, double value) {
+  const auto add = [&](Event::Quantity quantity, int k, double value) {
     Event event;
-    event.of = of, event.coordinate = k, event.value = value, event.stop = event.own = true;
+    event.quantity = quantity, event.coordinate = k, event.value = value, event.stop = event.is_joint_event = true;
     events_.push_back(event);
   };
   for (int k = 0; k < system_.core.n; ++k) {
-    if (joints.rubs_at(k)) add(Event::q_dot, k, 0.0);
+    if (joints.has_friction_at(k)) add(Event::q_dot, k, 0.0);
     for (double stop : {joints.table.lower(k), joints.table.upper(k)})
       if (std::isfinite(stop)) add(Event::q, k, stop);
   }
-  if (joints.any()) add(Event::holding, 0, 0.0);
+  if (joints.has_events()) add(Event::holding_margin, 0, 0.0);
 }
 
-void Events::begin() {
-  met.clear(), changing.clear();
+void Events::reset() {
+  occurrences.clear(), joint_events.clear();
   signs_.assign(events_.size(), 0), active_.assign(events_.size(), 1);
   crossed_at_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN()), largest_.assign(events_.size(), 0.0);
   resting_.assign(events_.size(), 0), joints_changed_ = false;
-  jump();
+  restart();
 }
 
-// What a joint is off zero where its motion begins counts as zero: it comes of how exactly an event is located. A joint
-// that is off its stop is known to be, however little that is.
-void Events::monitor_joints(In coordinates, In velocity, double within) {
+// A small offset of a joint at the start of its motion counts as zero, since events are located with a tolerance. A
+// joint that is off its stop is known to be off it, however close it is.
+void Events::monitor_joints(In coordinates, In velocity, double time_tolerance) {
   const Joints& joints = system_.core.joints;
-  changing.clear();
-  joints_changed_ = true, change_time_tolerance_ = within;
+  joint_events.clear();
+  joints_changed_ = true, change_time_tolerance_ = time_tolerance;
   for (size_t i = 0; i < events_.size(); ++i) {
     Event& event = events_[i];
-    if (!event.own) {
-      last_[i] = std::numeric_limits<double>::quiet_NaN();
+    if (!event.is_joint_event) {
+      last_values_[i] = std::numeric_limits<double>::quiet_NaN();
       continue;
     }
     const int k = event.coordinate;
-    double here = 0.0;
-    if (event.of == Event::q_dot) {
-      signs_[i] = joints.sign[k], active_[i] = joints.sign[k] != 0, here = velocity(k);
-    } else if (event.of == Event::q) {
+    double offset = 0.0;
+    if (event.quantity == Event::q_dot) {
+      signs_[i] = joints.sliding_direction[k], active_[i] = joints.sliding_direction[k] != 0, offset = velocity(k);
+    } else if (event.quantity == Event::q) {
       const int side = event.value == joints.table.lower(k) ? -1 : 1;
-      signs_[i] = -side, active_[i] = joints.touch[k] != side, here = coordinates(k) - event.value;
+      signs_[i] = -side, active_[i] = joints.stop_side[k] != side, offset = coordinates(k) - event.value;
     } else {
       signs_[i] = 1, active_[i] = !joints.locked.empty();
     }
-    event.floor = here * signs_[i] > (event.of == Event::q ? 0.0 : least_known) ? 0.0 : 2.0 * std::abs(here);
-    // A joint that leaves its stop from rest may move into it first, by what rounding made of its rate.
-    if (event.of == Event::q) event.floor = std::max(event.floor, place_rounding * joints.table.reach(k));
+    event.zero_threshold =
+        offset * signs_[i] > (event.quantity == Event::q ? 0.0 : min_known_rate) ? 0.0 : 2.0 * std::abs(offset);
+    // Rounding of its rate may move a joint into its stop before it leaves.
+    if (event.quantity == Event::q)
+      event.zero_threshold = std::max(event.zero_threshold, coordinate_rounding * joints.table.reach(k));
   }
 }
 
-void Events::jump() {
-  known_ = false, end_holds_ = std::numeric_limits<double>::quiet_NaN();
-  last_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN());
+void Events::restart() {
+  start_is_known_ = false, end_holding_margin_ = std::numeric_limits<double>::quiet_NaN();
+  last_values_.assign(events_.size(), std::numeric_limits<double>::quiet_NaN());
 }
 
-// The core is at the end of a step, which the right-hand side was evaluated at last, as f.
-void Events::take_end(End& end, In f) {
+// Store coordinates, velocities and accelerations at an end of the step, where `f` was evaluated last.
+void Events::record_end(End& end, In f) {
   system_.core.tree.to_coordinates(system_.core.q_tree, end.q);
   end.v = system_.velocity;
-  end.accelerated = system_.tree_acceleration(f, end.a);
+  end.has_acceleration = system_.tree_acceleration(f, end.a);
 }
 
-double Events::holding() const {
+double Events::holding_margin() const {
   Core& core = system_.core;
   return core.joints.locked.empty() ? std::numeric_limits<double>::quiet_NaN() : core.holding_margin();
 }
 
-void Events::begun() {
+void Events::start_step() {
   if (events_.empty()) return;
-  if (values_at_ != step_.t) jump();
-  take_end(start_, step_.f), known_ = true, values_at_ = step_.t;
+  if (last_values_time_ != step_.t) restart();
+  record_end(start_, step_.f), start_is_known_ = true, last_values_time_ = step_.t;
   for (size_t k = 0; k < events_.size(); ++k)
-    if (events_[k].of == Event::holding) last_[k] = holding();
+    if (events_[k].quantity == Event::holding_margin) last_values_[k] = holding_margin();
 }
 
-bool Events::at(Interpolant& motion, double t) {
-  closed_ = only_y;
+bool Events::set_state(Interpolant& motion, double t) {
+  core_accuracy_ = not_set;
   if (t == step_.t_new)
     y_ = step_.y_new;
   else if (t == step_.t)
     y_ = step_.y;
   else
-    return motion.between(t, y_);
+    return motion.interpolate(t, y_);
   return true;
 }
 
-bool Events::place(double t, Closed wanted) {
-  if (closed_ >= wanted) return true;
-  closed_ = wanted;
-  if (wanted == as_y_is) return system_.as_is(t, y_);
-  if (!system_.exact(t, y_)) return false;
-  bool changed = wanted == at_rest && !system_.core.joints.locked.empty();
-  for (int k = 0; k < 2 && changed; ++k)  // twice: moving a joint to its place changes the rates
-    if (!system_.keep_locked(y_, 0.0, changed) || !system_.exact(t, y_)) return false;
+bool Events::set_core(double t, CoreAccuracy required) {
+  if (core_accuracy_ >= required) return true;
+  core_accuracy_ = required;
+  if (required == unprojected) return system_.sync_core_unprojected(t, y_);
+  if (!system_.sync_core(t, y_)) return false;
+  bool changed = required == joints_at_rest && !system_.core.joints.locked.empty();
+  for (int k = 0; k < 2 && changed; ++k)  // moving a joint to its position changes rates, so repeat once
+    if (!system_.correct_locked_joints(y_, 0.0, changed) || !system_.sync_core(t, y_)) return false;
   return true;
 }
 
-bool Events::value(int k, double t, double& gap) {
+bool Events::event_value(int k, double t, double& value) {
   const Event& event = events_[k];
-  if (event.of <= Event::q_dot && system_.shows(y_, event.coordinate, event.of == Event::q_dot, gap))
-    return gap = event.sign * (gap - event.value), true;
-  return event.of == Event::holding ? place(t, as_y_is) && value_there(k, t, gap) : exact_value(k, t, gap);
+  if (event.quantity <= Event::q_dot &&
+      system_.read_from_state(y_, event.coordinate, event.quantity == Event::q_dot, value))
+    return value = event.sign * (value - event.value), true;
+  return event.quantity == Event::holding_margin ? set_core(t, unprojected) && value_at_core(k, t, value)
+                                                 : exact_value(k, t, value);
 }
 
-bool Events::exact_value(int k, double t, double& gap) {
-  return place(t, events_[k].of == Event::function ? at_rest : exactly) && value_there(k, t, gap);
+bool Events::exact_value(int k, double t, double& value) {
+  return set_core(t, events_[k].quantity == Event::function ? joints_at_rest : projected) && value_at_core(k, t, value);
 }
 
-bool Events::value_there(int k, double t, double& gap) {
+bool Events::value_at_core(int k, double t, double& value) {
   const Event& event = events_[k];
   Core& core = system_.core;
-  switch (event.of) {
+  switch (event.quantity) {
     case Event::q:
       core.tree.to_coordinates(core.q_tree, coordinates_);
-      gap = coordinates_(event.coordinate) - event.value;
+      value = coordinates_(event.coordinate) - event.value;
       break;
-    case Event::q_dot:
-      gap = system_.velocity(event.coordinate) - event.value;
-      break;
+    case Event::q_dot: value = system_.velocity(event.coordinate) - event.value; break;
     case Event::sigma_min_phi_z:
-      core.jacobian();
-      phi_z_.resize(core.rows.J.rows(), static_cast<Eigen::Index>(core.z.size()));
-      for (size_t j = 0; j < core.z.size(); ++j) phi_z_.col(j) = core.rows.J.col(core.z[j]);
-      gap = svd_phi_z_.compute(phi_z_).singularValues()(core.rank - 1) - event.value;
+      core.compute_J();
+      phi_z_.resize(core.constraints.J.rows(), static_cast<Eigen::Index>(core.z.size()));
+      for (size_t j = 0; j < core.z.size(); ++j) phi_z_.col(j) = core.constraints.J.col(core.z[j]);
+      value = svd_phi_z_.compute(phi_z_).singularValues()(core.rank - 1) - event.value;
       break;
     case Event::sigma_min_J:
-      core.jacobian();
-      gap = svd_J_.compute(core.rows.J).singularValues()(core.rank - 1) - event.value;
+      core.compute_J();
+      value = svd_J_.compute(core.constraints.J).singularValues()(core.rank - 1) - event.value;
       break;
     case Event::function:
-      if (!event.call(t, system_, gap)) return false;
+      if (!event.evaluate(t, system_, value)) return false;
       break;
-    case Event::holding:
+    case Event::holding_margin:
       if (!system_.acceleration(t, coordinates_)) return false;
-      gap = core.holding_margin();
+      value = core.holding_margin();
   }
-  gap *= event.sign;
-  if (std::isfinite(gap)) return true;
-  failed = k, failed_value = gap;
+  value *= event.sign;
+  if (std::isfinite(value)) return true;
+  failed = k, failed_value = value;
   return false;
 }
 
-void Events::arrived() {
-  if (!events_.empty()) take_end(end_, step_.f_new), end_holds_ = holding();
+void Events::end_step() {
+  if (!events_.empty()) record_end(end_, step_.f_new), end_holding_margin_ = holding_margin();
 }
 
-bool Events::sample(Interpolant& motion, Eigen::Index first, Eigen::Index stride) {
+bool Events::sample_values(Interpolant& motion, Eigen::Index first, Eigen::Index stride) {
   const double h = step_.t_new - step_.t;
-  for (Eigen::Index i = first; i < places_.size(); i += stride) {
-    const bool ends = i + 1 == places_.size();
-    const double t = ends ? step_.t_new : step_.t + h * places_(i);
-    if (!at(motion, t)) return false;
-    for (int k : wanted_) {
-      double known = std::numeric_limits<double>::quiet_NaN();
-      if (i == 0 && values_at_ == step_.t) known = last_[k];
-      if (ends && events_[k].of == Event::holding) known = end_holds_;
-      if (!std::isnan(known))
-        values_(i, k) = known;
-      else if (!value(k, t, values_(i, k)))
+  for (Eigen::Index i = first; i < sample_points_.size(); i += stride) {
+    const bool ends = i + 1 == sample_points_.size();
+    const double t = ends ? step_.t_new : step_.t + h * sample_points_(i);
+    if (!set_state(motion, t)) return false;
+    for (int k : to_search_) {
+      double known_value = std::numeric_limits<double>::quiet_NaN();
+      if (i == 0 && last_values_time_ == step_.t) known_value = last_values_[k];
+      if (ends && events_[k].quantity == Event::holding_margin) known_value = end_holding_margin_;
+      if (!std::isnan(known_value))
+        values_(i, k) = known_value;
+      else if (!event_value(k, t, values_(i, k)))
         return false;
     }
   }
   return true;
 }
 
-// Of a coordinate or a rate, where both ends of the step are known: it begins on the side where the last one ended, unless
-// an impact has taken a rate over its value.
-bool Events::goes_on(int k) const {
+// For a coordinate or rate known at both ends of the step: whether it starts on the side where it was. An impact may
+// move a rate across its value.
+bool Events::continues_on_same_side(int k) const {
   const Event& event = events_[k];
-  const double here = (event.of == Event::q ? start_.q : start_.v)(event.coordinate) - event.value;
-  return event.sign * here * signs_[k] > 0.0;
+  const double offset = (event.quantity == Event::q ? start_.q : start_.v)(event.coordinate) - event.value;
+  return event.sign * offset * signs_[k] > 0.0;
 }
 
-bool Events::check(Interpolant& motion, bool last, bool silent, double& halt) {
-  halt = std::numeric_limits<double>::infinity();
+bool Events::find_events(Interpolant& motion, bool last, bool joints_only, double& stop_time) {
+  stop_time = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
-  wanted_.clear(), sampled_.clear(), found_.clear();
+  to_search_.clear(), sampled_.clear(), found_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k) {
     const Event& event = events_[k];
-    if (!active_[k] || (silent && !event.own)) continue;
+    if (!active_[k] || (joints_only && !event.is_joint_event)) continue;
     if (is_held(event)) {
-      const double gap = held_value(event);
-      if (joints_changed_) report_arrival(k, std::abs(gap) <= event.floor ? 0 : gap > 0 ? 1 : -1, halt);
-    } else if (!(signs_[k] && ((ruled_out(event) && goes_on(k)) || holds_by_far(k)))) {
-      wanted_.push_back(k);
+      const double value = held_value(event);
+      if (joints_changed_)
+        report_arrival(k, std::abs(value) <= event.zero_threshold ? 0 : value > 0 ? 1 : -1, stop_time);
+    } else if (!(signs_[k] && ((is_excluded(event) && continues_on_same_side(k)) || joints_clearly_held(k)))) {
+      to_search_.push_back(k);
     }
   }
-  if (!wanted_.empty()) {
-    const bool locked = std::any_of(wanted_.begin(), wanted_.end(), [&](int k) { return events_[k].of == Event::holding; });
-    if (!sample(motion, 0, locked ? 2 : 1)) return false;
-    sampled_ = wanted_;
-    wanted_.erase(std::remove_if(wanted_.begin(), wanted_.end(), [&](int k) { return holds(k); }), wanted_.end());
-    if (!wanted_.empty() && !((!locked || sample(motion, 1, 2)) && find(motion, last, halt))) return false;
+  if (!to_search_.empty()) {
+    const bool locked = std::any_of(to_search_.begin(), to_search_.end(),
+                                    [&](int k) { return events_[k].quantity == Event::holding_margin; });
+    if (!sample_values(motion, 0, locked ? 2 : 1)) return false;
+    sampled_ = to_search_;
+    to_search_.erase(
+        std::remove_if(to_search_.begin(), to_search_.end(), [&](int k) { return joints_hold_throughout(k); }),
+        to_search_.end());
+    if (!to_search_.empty() && !((!locked || sample_values(motion, 1, 2)) && search_step(motion, last, stop_time)))
+      return false;
   }
-  if (!wanted_.empty() || !found_.empty()) report(halt);
-  joints_changed_ = joints_changed_ && silent;
-  values_at_ = step_.t_new;
-  std::fill(last_.begin(), last_.end(), std::numeric_limits<double>::quiet_NaN());
-  known_ = !std::isfinite(halt);
-  if (known_)
+  if (!to_search_.empty() || !found_.empty()) report_occurrences(stop_time);
+  joints_changed_ = joints_changed_ && joints_only;
+  last_values_time_ = step_.t_new;
+  std::fill(last_values_.begin(), last_values_.end(), std::numeric_limits<double>::quiet_NaN());
+  start_is_known_ = !std::isfinite(stop_time);
+  if (start_is_known_)
     for (size_t k = 0; k < events_.size(); ++k)
-      if (events_[k].of == Event::holding) last_[k] = end_holds_;
-  if (known_)
-    for (int k : sampled_) last_[k] = values_(places_.size() - 1, k);
+      if (events_[k].quantity == Event::holding_margin) last_values_[k] = end_holding_margin_;
+  if (start_is_known_)
+    for (int k : sampled_) last_values_[k] = values_(sample_points_.size() - 1, k);
   std::swap(start_, end_);
   return true;
 }
 
-bool Events::find(Interpolant& motion, bool last, double& halt) {
+bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
   const bool resting = !system_.core.joints.locked.empty();
-  for (int k : wanted_) {
-    const auto value_at = [&](double t, double& there) { return at(motion, t) && value(k, t, there); };
-    const auto exact_at = [&](double t, double& there) { return at(motion, t) && exact_value(k, t, there); };
-    const Gap gap = std::cref(value_at), exact = std::cref(exact_at);  // which allocate nothing
+  for (int k : to_search_) {
+    const auto value_at = [&](double t, double& there) { return set_state(motion, t) && event_value(k, t, there); };
+    const auto exact_at = [&](double t, double& there) { return set_state(motion, t) && exact_value(k, t, there); };
+    const ScalarFunction value = std::cref(value_at), exact = std::cref(exact_at);  // references, to avoid allocations
     const Event& event = events_[k];
-    const bool rough = event.of <= Event::q_dot || event.of == Event::holding;
-    Walk& walked = walks_[k];
-    double floor = event.floor;
-    if (!event.own) {
+    const bool has_cheap_value = event.quantity <= Event::q_dot || event.quantity == Event::holding_margin;
+    RootSearch& search = searches_[k];
+    double zero_threshold = event.zero_threshold;
+    if (!event.is_joint_event) {
       largest_[k] = std::max(largest_[k], values_.col(k).cwiseAbs().maxCoeff());
-      if (event.of == Event::function && resting) floor = function_rounding * std::max(1.0, largest_[k]);
-      // A function that was on zero until joints changed, or has just come there, counts as zero where the step begins.
+      if (event.quantity == Event::function && resting) zero_threshold = function_rounding * std::max(1.0, largest_[k]);
+      // A function that was on zero until joints changed, or has just reached it, counts as zero where the step
+      // begins.
       const double first = std::abs(values_(0, k));
       const bool was_zero = signs_[k] ? has_just_crossed(k) : resting_[k] != 0;
-      if (joints_changed_ && was_zero && first <= zero_tolerance * largest_[k]) floor = std::max(floor, 2.0 * first);
+      if (joints_changed_ && was_zero && first <= relative_zero_tolerance * largest_[k])
+        zero_threshold = std::max(zero_threshold, 2.0 * first);
     }
-    if (!walk(gap, step_.t, step_.t_new, values_.col(k), signs_[k], floor, walked, rough ? &exact : nullptr)) return false;
-    if (!event.own && stays_on_value(k)) {
-      walked.found.clear(), walked.sign = signs_[k];
-      if (joints_changed_) report_arrival(k, 0, halt), walked.sign = signs_[k];
+    if (!search.find(value, {step_.t, step_.t_new}, values_.col(k), signs_[k], zero_threshold,
+                     has_cheap_value ? &exact : nullptr))
+      return false;
+    if (!event.is_joint_event && stays_on_value(k)) {
+      search.sign_changes.clear(), search.sign = signs_[k];
+      if (joints_changed_) report_arrival(k, 0, stop_time), search.sign = signs_[k];
       continue;
     }
-    if (last && walked.on_zero && walked.sign && !event.own) walked.found.emplace_back(step_.t_new, -walked.sign);
-    for (const auto& [t, direction] : walked.found) {
+    if (last && search.on_zero && search.sign && !event.is_joint_event)
+      search.sign_changes.emplace_back(step_.t_new, -search.sign);
+    for (const auto& [t, direction] : search.sign_changes) {
       if (event.direction != 0 && event.direction != direction) continue;
       found_.push_back({t, k, direction});
-      if (event.stop) halt = std::min(halt, t);
+      if (event.stop) stop_time = std::min(stop_time, t);
     }
   }
   return true;
 }
 
-// Report the events until the step is halted. If joints change at that time, an event that is found a rounding later belongs
-// to the same instant: the motion behind it is never made.
-void Events::report(double halt) {
-  std::sort(found_.begin(), found_.end(), [](const Crossed& a, const Crossed& b) {
+// Report the events up to the stop. If joint modes change at that time, events a rounding error later belong to the
+// same instant: the motion behind it is never made.
+void Events::report_occurrences(double stop_time) {
+  std::sort(found_.begin(), found_.end(), [](const EventOccurrence& a, const EventOccurrence& b) {
     return a.t != b.t ? a.t < b.t : a.event < b.event;
   });
-  changing.clear(), halted_ = false;
-  const bool changes = std::any_of(found_.begin(), found_.end(), [&](const Crossed& crossed) {
-    return crossed.t == halt && events_[crossed.event].own;
+  joint_events.clear(), stopped_ = false;
+  const bool changes = std::any_of(found_.begin(), found_.end(), [&](const EventOccurrence& occurrence) {
+    return occurrence.t == stop_time && events_[occurrence.event].is_joint_event;
   });
-  const double until = changes ? halt + time_tolerance : halt;
-  for (const Crossed& crossed : found_) {
-    const Event& event = events_[crossed.event];
-    if (crossed.t > (event.own ? halt : until)) continue;
-    if (event.own)
-      changing.push_back(event);
+  const double until = changes ? stop_time + simultaneous_time_tolerance : stop_time;
+  for (const EventOccurrence& occurrence : found_) {
+    const Event& event = events_[occurrence.event];
+    if (occurrence.t > (event.is_joint_event ? stop_time : until)) continue;
+    if (event.is_joint_event)
+      joint_events.push_back(event);
     else
-      met.push_back({std::min(crossed.t, halt), crossed.event, crossed.direction}), halted_ |= event.stop;
+      occurrences.push_back({std::min(occurrence.t, stop_time), occurrence.event, occurrence.direction}),
+          stopped_ |= event.stop;
   }
-  for (int k : wanted_) {
-    if (!std::isfinite(halt)) signs_[k] = walks_[k].sign;
-    for (const auto& [t, direction] : walks_[k].found)  // the sign that a function goes on with from there
-      if (t <= (events_[k].own ? halt : until)) signs_[k] = direction, crossed_at_[k] = std::min(t, halt);
+  for (int k : to_search_) {
+    if (!std::isfinite(stop_time)) signs_[k] = searches_[k].sign;
+    for (const auto& [t, direction] : searches_[k].sign_changes)  // sign after the crossing
+      if (t <= (events_[k].is_joint_event ? stop_time : until))
+        signs_[k] = direction, crossed_at_[k] = std::min(t, stop_time);
   }
 }
 

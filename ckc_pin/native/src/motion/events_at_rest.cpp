@@ -1,4 +1,4 @@
-// Events where joints change: a jump over a value, and functions that come to their value and stay there.
+// Events at transitions of joint modes: jumps across a value, and functions that reach their value and stay there.
 #include <algorithm>
 #include <cmath>
 
@@ -8,67 +8,67 @@
 
 namespace ckc {
 
-constexpr double rest_tolerance = 1e-9;       // rad, m and their rates: what is no larger may be rounding
-constexpr double max_relative_rate = 1e-4;    // of the fastest joint: a joint that is faster can move, and is not examined
-constexpr double mobility_threshold = 1e-10;  // of the motion that the same force would give the joint alone
+constexpr double rest_tolerance = 1e-9;       // rad, m and their rates: smaller values may be rounding
+constexpr double max_relative_rate = 1e-4;    // of the fastest joint: faster joints can move and need no further check
+constexpr double mobility_threshold = 1e-10;  // of the response that the joint would have without loops
 
-// A function on its value has no sign, and rounding gives it none. A function that crossed its value in the step that ends
-// here, and is still as near to it as the tolerances allow, counts as crossing it here.
+// A function on its value has no sign, so rounding must not assign one. A function that crossed its value in the step
+// that ends here, and is still zero within the tolerances, crosses here.
 bool Events::learn_signs_before_change(double t, In y) {
   const Vector& reach = system_.core.joints.table.reach;
-  y_ = y, closed_ = only_y;
+  y_ = y, core_accuracy_ = not_set;
   for (int k = 0; k < static_cast<int>(events_.size()); ++k) {
     const Event& event = events_[k];
-    const bool crossed = crossed_at_[k] >= step_.t_old;
-    if (event.own || (signs_[k] ? !crossed : resting_[k])) continue;
-    double gap;
-    if (!exact_value(k, t, gap)) return false;
-    const double size = event.of == Event::function ? function_rounding * largest_[k]
-                        : event.of <= Event::q_dot  ? rest_tolerance * reach(event.coordinate)
-                                                    : rest_tolerance;
-    if (crossed && std::abs(gap) <= zero_tolerance * largest_[k])
+    const bool just_crossed = crossed_at_[k] >= step_.t_old;
+    if (event.is_joint_event || (signs_[k] ? !just_crossed : resting_[k])) continue;
+    double value;
+    if (!exact_value(k, t, value)) return false;
+    const double size = event.quantity == Event::function ? function_rounding * largest_[k]
+                        : event.quantity <= Event::q_dot  ? rest_tolerance * reach(event.coordinate)
+                                                          : rest_tolerance;
+    if (just_crossed && std::abs(value) <= relative_zero_tolerance * largest_[k])
       crossed_at_[k] = t;
-    else if (!signs_[k] && std::abs(gap) > size)
-      signs_[k] = gap > 0 ? 1 : -1;
+    else if (!signs_[k] && std::abs(value) > size)
+      signs_[k] = value > 0 ? 1 : -1;
   }
   return true;
 }
 
 bool Events::is_held(const Event& event) const {
-  return !event.own && event.of <= Event::q_dot && system_.core.joints.is_locked(event.coordinate);
+  return !event.is_joint_event && event.quantity <= Event::q_dot && system_.core.joints.is_locked(event.coordinate);
 }
 
 double Events::held_value(const Event& event) const {
-  return event.sign * ((event.of == Event::q ? system_.core.joints.place(event.coordinate) : 0.0) - event.value);
+  return event.sign *
+         ((event.quantity == Event::q ? system_.core.joints.locked_at(event.coordinate) : 0.0) - event.value);
 }
 
-void Events::report_arrival(int k, int sign, double& halt) {
+void Events::report_arrival(int k, int sign, double& stop_time) {
   const Event& event = events_[k];
   const int before = signs_[k], direction = -before;
   signs_[k] = sign, resting_[k] = !sign;
   if (!before || sign == before) return;
-  if (!sign && has_just_crossed(k)) return;  // the crossing was found in the step before
+  if (!sign && has_just_crossed(k)) return;  // the crossing was found in the previous step
   crossed_at_[k] = step_.t;
   if (event.direction && event.direction != direction) return;
   found_.push_back({step_.t, k, direction});
-  if (event.stop) halt = std::min(halt, step_.t);
+  if (event.stop) stop_time = std::min(stop_time, step_.t);
 }
 
 bool Events::has_just_crossed(int k) const { return std::abs(step_.t - crossed_at_[k]) <= change_time_tolerance_; }
 
 bool Events::stays_on_value(int k) {
   const Event& event = events_[k];
-  const Walk& walked = walks_[k];
-  if (joints_changed_ && walked.always_on_zero) return true;
-  if (event.of > Event::q_dot) return false;
-  const bool unchanged = walked.found.empty() && walked.sign == signs_[k];
-  if (unchanged && !(signs_[k] && (joints_changed_ || walked.on_zero))) return false;
+  const RootSearch& search = searches_[k];
+  if (joints_changed_ && search.always_on_zero) return true;
+  if (event.quantity > Event::q_dot) return false;
+  const bool unchanged = search.sign_changes.empty() && search.sign == signs_[k];
+  if (unchanged && !(signs_[k] && (joints_changed_ || search.on_zero))) return false;
   return is_still(k) && !can_move(event.coordinate, step_.t, step_.y) &&
          !can_move(event.coordinate, step_.t_new, step_.y_new);
 }
 
-// Whether the values of a coordinate or a rate are those of a joint at rest on the event's value, as far as rounding and
-// the tolerance allow.
+// Whether the sampled coordinate or rate is constant on the event's value within rounding and tolerance.
 bool Events::is_still(int k) const {
   const Event& event = events_[k];
   const Vector& reach = system_.core.joints.table.reach;
@@ -78,7 +78,7 @@ bool Events::is_still(int k) const {
     fastest = std::max(fastest, end->v.cwiseQuotient(reach).lpNorm<Eigen::Infinity>());
   const double low = values_.col(k).minCoeff(), high = values_.col(k).maxCoeff();
   const double largest = std::max(std::abs(low), std::abs(high));
-  if (event.of == Event::q_dot)
+  if (event.quantity == Event::q_dot)
     return std::abs(event.value) <= rest_tolerance * size &&
            largest <= (max_relative_rate * fastest + rest_tolerance) * size;
   const double h = step_.t_new - step_.t;
@@ -86,20 +86,20 @@ bool Events::is_still(int k) const {
          high - low <= (max_relative_rate * fastest * h + rest_tolerance) * size;
 }
 
-// The joint's response to a force on it, less what the forces of the joints at rest take away.
+// Response of the coordinate to a force on it, with the joints at rest held in place.
 bool Events::can_move(int coordinate, double t, In y) {
   Core& core = system_.core;
   const Indices& locked = core.joints.locked;
-  Indices at = locked;
-  at.push_back(coordinate);
-  closed_ = only_y;
-  if (!system_.exact(t, y) || !core.responses(at, responses_)) return true;
-  const auto m = static_cast<Eigen::Index>(at.size()), last = m - 1;
+  Indices coordinates = locked;
+  coordinates.push_back(coordinate);
+  core_accuracy_ = not_set;
+  if (!system_.sync_core(t, y) || !core.unit_force_responses(coordinates, responses_)) return true;
+  const auto m = static_cast<Eigen::Index>(coordinates.size()), last = m - 1;
   Vector scale(m);
-  for (Eigen::Index i = 0; i < m; ++i) scale(i) = std::sqrt(core.inertia_alone(at[i]));
-  Matrix A(m, m);  // responses to unit forces, relative to those of joints without loops
+  for (Eigen::Index i = 0; i < m; ++i) scale(i) = std::sqrt(core.joint_inertia(coordinates[i]));
+  Matrix A(m, m);  // relative to the responses without loops
   for (Eigen::Index i = 0; i < m; ++i)
-    for (Eigen::Index j = 0; j < m; ++j) A(i, j) = scale(i) * scale(j) * responses_(at[i], j);
+    for (Eigen::Index j = 0; j < m; ++j) A(i, j) = scale(i) * scale(j) * responses_(coordinates[i], j);
   double moves = A(last, last);
   if (last) {
     Eigen::CompleteOrthogonalDecomposition<Matrix> held(last, last);

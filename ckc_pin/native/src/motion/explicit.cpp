@@ -8,15 +8,16 @@
 namespace ckc {
 
 constexpr double safety = 0.9, min_factor = 0.2, max_factor = 10.0;
-// Of the length that the error proposes, a third of which are refused: 7 % less work.
-constexpr double step_safety = 5.0 / 6.0;
-constexpr double near_refusal = 0.3;  // of a disagreement that refuses a step
-// Of a step; more when two steps in a row ask for it, for one may do so by chance.
-constexpr double growth = 2.0;
+// Factor of the step size that the error proposes. A third of the full steps would be rejected; this saves 7 % of the
+// work.
+constexpr double length_safety = 5.0 / 6.0;
+constexpr double max_agreement_for_growth = 0.3;  // of a disagreement that rejects a step
+// Largest growth of one step. It may be exceeded if two steps in a row ask for it, since one may do so by chance.
+constexpr double max_single_growth = 2.0;
 
 namespace {
 
-// `first`: how many entries the first row has; each later one has one more if `triangular`.
+// Read a table of coefficients. If `triangular`, row i has i entries.
 Matrix rows_of(const double* values, int rows, int columns, bool triangular) {
   Matrix a = Matrix::Zero(rows, columns);
   for (int i = triangular ? 1 : 0; i < rows; ++i)
@@ -26,26 +27,27 @@ Matrix rows_of(const double* values, int rows, int columns, bool triangular) {
 
 Vector vector_of(const double* values, int size) { return Eigen::Map<const Vector>(values, size); }
 
-// What the first rates make of h by their coefficients, many of which are zero. Some numbers of all rates after others, so
-// that what they add up to stays in registers.
+// sum += h * (linear combination of the first `count` rates). Zero coefficients are skipped, and numbers are
+// processed in blocks so that their sums stay in registers.
 template <class Coefficients>
-void add(const Matrix& rates, const Coefficients& of, Eigen::Index count, double h, Out sum) {
-  constexpr Eigen::Index at_a_time = 8, most = 16;
-  double factor[most];
-  const double* rate[most];
-  int used = 0;
+void add_combination(const Matrix& rates, const Coefficients& coefficients, Eigen::Index count, double h, Out sum) {
+  constexpr Eigen::Index block_size = 8, max_stages = 16;
+  double factor[max_stages];
+  const double* rate[max_stages];
+  int count_used = 0;
   for (Eigen::Index i = 0; i < count; ++i)
-    if (of(i) != 0.0) factor[used] = h * of(i), rate[used++] = rates.col(i).data();
+    if (coefficients(i) != 0.0) factor[count_used] = h * coefficients(i), rate[count_used++] = rates.col(i).data();
   const Eigen::Index size = sum.size();
   Eigen::Index k = 0;
-  for (; k + at_a_time <= size; k += at_a_time) {
-    Eigen::Array<double, at_a_time, 1> x = sum.segment<at_a_time>(k);
-    for (int i = 0; i < used; ++i) x += factor[i] * Eigen::Map<const Eigen::Array<double, at_a_time, 1>>(rate[i] + k);
-    sum.segment<at_a_time>(k) = x;
+  for (; k + block_size <= size; k += block_size) {
+    Eigen::Array<double, block_size, 1> x = sum.segment<block_size>(k);
+    for (int i = 0; i < count_used; ++i)
+      x += factor[i] * Eigen::Map<const Eigen::Array<double, block_size, 1>>(rate[i] + k);
+    sum.segment<block_size>(k) = x;
   }
   for (; k < size; ++k) {
     double x = sum(k);
-    for (int i = 0; i < used; ++i) x += factor[i] * rate[i][k];
+    for (int i = 0; i < count_used; ++i) x += factor[i] * rate[i][k];
     sum(k) = x;
   }
 }
@@ -71,92 +73,98 @@ Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tole
 }
 
 bool Explicit::stages(double h) {
-  const bool whole = this->whole(h);
+  const bool full_motion = this->checks_full_motion(h);
   K_.col(0) = step_.f;
-  if (whole) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
+  if (full_motion) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
   for (int s = 1; s < stages_; ++s) {
     y_stage_ = step_.y;
-    add(K_, A_.row(s), s, h, y_stage_);
+    add_combination(K_, A_.row(s), s, h, y_stage_);
     if (!evaluate(step_.t + C_(s) * h, y_stage_, K_.col(s))) return false;
-    if (whole) system_.whole(K_.col(s), x_stage_, X_.col(s));
+    if (full_motion) system_.full_motion(K_.col(s), x_stage_, X_.col(s));
   }
   step_.y_new = step_.y;
-  add(K_, B_, stages_, h, step_.y_new);
+  add_combination(K_, B_, stages_, h, step_.y_new);
   if (!evaluate(step_.t + h, step_.y_new, step_.f_new)) return false;
   K_.col(stages_) = step_.f_new;
-  if (step_.x.size()) system_.whole(step_.f_new, step_.x_new, step_.x_dot_new);
-  if (whole) X_.col(stages_) = step_.x_dot_new;
+  if (step_.x.size()) system_.full_motion(step_.f_new, step_.x_new, step_.x_dot_new);
+  if (full_motion) X_.col(stages_) = step_.x_dot_new;
   return true;
 }
 
-// Of the whole motion, so that it does not matter which coordinates y has, and of what y has beside it.
+// Error of the full motion, which does not depend on the coordinates in y, and of the auxiliary part of y.
 double Explicit::error(double h) {
-  const bool whole = this->whole(h);
-  const Eigen::Index moves = whole ? step_.x.size() : 0, rest = whole ? system_.beside() : step_.y.size();
+  const bool full_motion = this->checks_full_motion(h);
+  const Eigen::Index motion_size = full_motion ? step_.x.size() : 0,
+                     remaining_size = full_motion ? system_.auxiliary_size() : step_.y.size();
   double square[2] = {0.0, 0.0};
-  const auto look = [&](const Matrix& rates, const Vector& from, const Vector& to, Eigen::Index last) {
-    scale_ = tolerance_.between(from, to);
+  const auto add_weighted_error = [&](const Matrix& rates, const Vector& from, const Vector& to, Eigen::Index last) {
+    scale_ = tolerance_.scale(from, to);
     for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
       error_.setZero(from.size());
-      add(rates, E_[k], stages_ + 1, 1.0, error_);
+      add_combination(rates, E_[k], stages_ + 1, 1.0, error_);
       square[k] += (error_.tail(last).array() / scale_.tail(last).array()).matrix().squaredNorm();
     }
   };
-  if (moves) look(X_, step_.x, step_.x_new, moves);
-  if (rest) look(K_, step_.y, step_.y_new, rest);
-  const double size = static_cast<double>(moves + rest), of_five = h * std::sqrt(square[0] / size);
-  if (kind_ == rk45) return of_five;
-  reach_ = 0.5 * h * std::pow(std::max(of_five, 1e-10), -1.0 / 6.0);  // of RK45, whose error estimate is of order four
+  if (motion_size) add_weighted_error(X_, step_.x, step_.x_new, motion_size);
+  if (remaining_size) add_weighted_error(K_, step_.y, step_.y_new, remaining_size);
+  const double size = static_cast<double>(motion_size + remaining_size),
+               error_of_order_five = h * std::sqrt(square[0] / size);
+  if (kind_ == rk45) return error_of_order_five;
+  // step size for RK45, whose error estimate is of order four
+  order_five_step_ = 0.5 * h * std::pow(std::max(error_of_order_five, 1e-10), -1.0 / 6.0);
   if (square[0] == 0.0 && square[1] == 0.0) return 0.0;
   return h * square[0] / std::sqrt((square[0] + 0.01 * square[1]) * size);
 }
 
-bool Explicit::step(double t_bound) {
-  const double least = shortest(t_bound), exponent = -1.0 / (error_order() + 1);
-  double length = std::clamp(step_.h, least, std::max(least, tolerance_.max_step));
-  dense_ = false;
-  bool refused = false;
+bool Explicit::make_step(double t_bound) {
+  const double min_size = min_step_size(t_bound), exponent = -1.0 / (error_order() + 1);
+  double step_size = std::clamp(step_.h, min_size, std::max(min_size, tolerance_.max_step));
+  has_dense_output_ = false;
+  bool rejected = false;
   for (;;) {
-    if (!(length >= least)) return false;
-    step_.t_new = std::min(step_.t + length, t_bound);
+    if (!(step_size >= min_size)) return false;
+    step_.t_new = std::min(step_.t + step_size, t_bound);
     const double h = step_.t_new - step_.t;
-    length = h;
+    step_size = h;
     const bool exists = stages(h);
-    if (!exists && over()) return false;
+    if (!exists && must_stop()) return false;
     double size = exists ? error(h) : std::numeric_limits<double>::infinity();
     bool agrees = true;
-    double rest = 0.0;
-    if (exists && whole(h)) {
+    double disagreement_size = 0.0;
+    if (exists && checks_full_motion(h)) {
       x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
-      rest = disagreement(x_stage_);
-      agrees = rest < 1.0;
-      if (!agrees) size = std::max(size, rest);
+      disagreement_size = disagreement(x_stage_);
+      agrees = disagreement_size < 1.0;
+      if (!agrees) size = std::max(size, disagreement_size);
     }
     if (size < 1.0) {
-      const double most = refused ? 1.0 : max_factor;
-      double factor = step_safety * (size == 0.0 ? most : std::min(most, safety * std::pow(size, exponent)));
-      // What y tells differently from its rates may be rounding, which no shorter step makes less; no longer one is tried.
-      if (rest > near_refusal) factor = std::min(factor, 1.0);
-      growth_next_ = step_.t_new < t_bound && factor > growth;
-      step_.h_next = length * (growth_next_ && !growth_pending_ ? growth : factor);
-      if (step_.t_new == t_bound && !refused) step_.h_next = std::max(step_.h_next, step_.h);
-      if (kind_ == rk45) reach_ = length * step_safety * safety * std::pow(std::max(size, 1e-10), exponent);
+      const double max_growth = rejected ? 1.0 : max_factor;
+      double factor =
+          length_safety * (size == 0.0 ? max_growth : std::min(max_growth, safety * std::pow(size, exponent)));
+      // A disagreement between y and its rates may be rounding, which shorter steps do not reduce. Do not try a
+      // longer step.
+      if (disagreement_size > max_agreement_for_growth) factor = std::min(factor, 1.0);
+      growth_next_ = step_.t_new < t_bound && factor > max_single_growth;
+      step_.h_next = step_size * (growth_next_ && !growth_pending_ ? max_single_growth : factor);
+      if (step_.t_new == t_bound && !rejected) step_.h_next = std::max(step_.h_next, step_.h);
+      if (kind_ == rk45)
+        order_five_step_ = step_size * length_safety * safety * std::pow(std::max(size, 1e-10), exponent);
       return true;
     }
     if (!agrees && !return_to_start()) return false;
-    length *= std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
-    refused = true;
+    step_size *= std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
+    rejected = true;
     ++work_.rejected;
   }
 }
 
-void Explicit::retry(double length) {
-  Method::retry(length);
+void Explicit::reject_step(double step_size) {
+  Method::reject_step(step_size);
   growth_pending_ = false;
 }
 
-void Explicit::commit() {
-  Method::commit();
+void Explicit::accept_step() {
+  Method::accept_step();
   growth_pending_ = growth_next_;
 }
 
@@ -164,27 +172,27 @@ bool Explicit::extra_stages(double h) {
   for (Eigen::Index k = 0; k < C_extra_.size(); ++k) {
     const auto s = stages_ + 1 + k;
     y_stage_ = step_.y;
-    add(K_, A_extra_.row(k), s, h, y_stage_);
+    add_combination(K_, A_extra_.row(k), s, h, y_stage_);
     if (!evaluate(step_.t + C_extra_(k) * h, y_stage_, K_.col(s))) return false;
   }
   return true;
 }
 
-bool Explicit::between(double at, Out y_at) {
+bool Explicit::interpolate(double at, Out y_at) {
   const double h = step_.t_new - step_.t, x = (at - step_.t) / h;
-  if (!dense_ && kind_ == rk45) {
+  if (!has_dense_output_ && kind_ == rk45) {
     F_.noalias() = h * K_ * D_;
-  } else if (!dense_) {
+  } else if (!has_dense_output_) {
     if (!extra_stages(h)) return false;
     F_.col(0) = step_.y_new - step_.y;
     F_.col(1) = h * step_.f - F_.col(0);
     F_.col(2) = 2 * F_.col(0) - h * (step_.f_new + step_.f);
     for (Eigen::Index k = 0; k < D_.rows(); ++k) {
       F_.col(3 + k).setZero();
-      add(K_, D_.row(k), K_.cols(), h, F_.col(3 + k));
+      add_combination(K_, D_.row(k), K_.cols(), h, F_.col(3 + k));
     }
   }
-  dense_ = true;
+  has_dense_output_ = true;
   y_at.setZero();
   for (Eigen::Index i = F_.cols() - 1; i >= 0; --i) {
     y_at += F_.col(i);

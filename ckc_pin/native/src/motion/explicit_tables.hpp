@@ -1,13 +1,14 @@
 // Coefficients of the explicit methods, by rows.
 //
-// DOP853: E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, section II.10, with the extra
-// stages of its dense output. RK45: J. R. Dormand and P. J. Prince, A family of embedded Runge-Kutta formulae, 1980, with
-// the dense output of L. F. Shampine, Some practical Runge-Kutta formulas, 1986. As SciPy has them, which the tests compare.
+// DOP853: E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, section II.10, with the
+// extra stages of its dense output. RK45: J. R. Dormand and P. J. Prince, A family of embedded Runge-Kutta formulae,
+// 1980, with the dense output of L. F. Shampine, Some practical Runge-Kutta formulas, 1986. The tests compare them
+// with SciPy's.
 #pragma once
 
 namespace ckc {
 
-// Below the diagonal; then the extra stages, whole.
+// Entries below the diagonal; complete rows for the extra stages.
 constexpr double dop853_A[] = {
     0.05260015195876773, 0.0197250569845379, 0.0591751709536137, 0.02958758547680685, 0, 0.08876275643042054,
     0.2413651341592667, 0, -0.8845494793282861, 0.924834003261792, 0.037037037037037035, 0, 0, 0.17082860872947386,

@@ -12,276 +12,294 @@
 namespace ckc {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr double rounding = 1e-11;  // of the largest velocity: a joint is at rest; rad, or of the size: it is at a stop
-constexpr double gives = 1e-6;      // of the largest force: what holds no more is taken to be so much weaker
-constexpr double moves = 1e-12;     // of a joint's response without loops: they let it move
-constexpr double negligible = 1e-6, rounded = 1e-8;  // of what friction alone would accelerate
-constexpr double seen = 4.0;        // times how far a joint is off its stop
-constexpr double exactly = 1e-9;    // of the largest acceleration: none
+// of the largest velocity: below it a joint is at rest; rad, or relative to the size: below it a joint is at a stop
+constexpr double rate_rounding = 1e-11;
+// of the largest force: reduction of the bounds after a holding force was exceeded
+constexpr double holding_reduction = 1e-6;
+constexpr double min_mobility = 1e-12;  // of a joint's response without loops: below it the loops block the joint
+// of the acceleration that friction alone would cause
+constexpr double friction_scale_factor = 1e-6, friction_rounding_factor = 1e-8;
+constexpr double stop_offset_factor = 4.0;       // times the distance of a joint from its stop
+constexpr double acceleration_tolerance = 1e-9;  // of the largest acceleration: below it zero
 
-static bool among(const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); }
+static bool contains(const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); }
 
-JointChanges::JointChanges(System& system, double rise, const Tolerance& tolerance)
-    : system_(system), core_(system.core), joints_(system.core.joints), rise_(rise), tolerance_(tolerance) {
+JointModeTransitions::JointModeTransitions(System& system, double min_rise, const Tolerance& tolerance)
+    : system_(system), core_(system.core), joints_(system.core.joints), min_rise_(min_rise), tolerance_(tolerance) {
   const int n = core_.n;
-  for (Vector* x : {&coordinates, &v_, &a_, &held_, &rest_, &step_}) x->setZero(n);
-  near_.assign(n, 0);
+  for (Vector* x : {&coordinates, &v_, &a_, &held_acceleration_, &rest_speed_, &step_}) x->setZero(n);
+  nearby_stop_.assign(n, 0);
 }
 
-void JointChanges::begin() { known_ = false; }
+void JointModeTransitions::reset() { was_decided_ = false; }
 
-bool JointChanges::take_state(double t, Out y) {
-  if (!system_.exact(t, y)) return false;
-  system_.put_exact(y);
+bool JointModeTransitions::sync_state(double t, Out y) {
+  if (!system_.sync_core(t, y)) return false;
+  system_.write_projected_state(y);
   core_.tree.to_coordinates(core_.q_tree, coordinates);
   v_ = system_.velocity;
   return true;
 }
 
-bool JointChanges::decide(double t, Out y, const std::vector<Event>& met, double within) {
-  if (!take_state(t, y)) return false;
+bool JointModeTransitions::update(double t, Out y, const std::vector<Event>& triggered, double time_tolerance) {
+  if (!sync_state(t, y)) return false;
   const Vector& reach = joints_.table.reach;
-  joints_.account(coordinates);
-  // What comes to rest, or to a stop, at the same instant as what was met is as far from it as events are located.
-  rest_ = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
-  if (known_ && within > 0.0) {
+  joints_.account_friction_work(coordinates);
+  // Events are located within a tolerance, so joints that come to rest or reach a stop at the same instant may still
+  // be slightly off.
+  rest_speed_ = rate_rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>() * reach;
+  if (was_decided_ && time_tolerance > 0.0) {
     if (!system_.acceleration(t, a_)) return false;
-    rest_ += within * a_.cwiseAbs();
+    rest_speed_ += time_tolerance * a_.cwiseAbs();
   }
-  near_ = joints_.touch;
-  slips_ = false, flight = infinity;
+  nearby_stop_ = joints_.stop_side;
+  holding_was_exceeded_ = false, first_bounce_duration = infinity;
   for (int k = 0; k < core_.n; ++k)
     for (int side : {-1, 1}) {
-      const double off = std::abs(coordinates(k) - joints_.stop_at(k, side));
-      if (off <= rounding * reach(k) + within * std::abs(v_(k))) near_[k] = side;
+      const double offset = std::abs(coordinates(k) - joints_.stop_at(k, side));
+      if (offset <= rate_rounding * reach(k) + time_tolerance * std::abs(v_(k))) nearby_stop_[k] = side;
     }
-  for (const Event& event : met) {
+  for (const Event& event : triggered) {
     const int k = event.coordinate;
-    if (event.of == Event::q_dot) rest_(k) = infinity;
-    if (event.of == Event::q) near_[k] = event.value == joints_.table.lower(k) ? -1 : 1;
-    slips_ |= event.of == Event::holding;
+    if (event.quantity == Event::q_dot) rest_speed_(k) = infinity;
+    if (event.quantity == Event::q) nearby_stop_[k] = event.value == joints_.table.lower(k) ? -1 : 1;
+    holding_was_exceeded_ |= event.quantity == Event::holding_margin;
   }
-  for (int k : joints_.locked) rest_(k) = infinity;
+  for (int k : joints_.locked) rest_speed_(k) = infinity;
   const Indices held = joints_.locked;
-  arrived_.clear();
-  const Indices sign = joints_.sign;
-  if (!known_)
+  arrivals_.clear();
+  const Indices previous_direction = joints_.sliding_direction;
+  if (!was_decided_)
     for (int k = 0; k < core_.n; ++k)
-      if (joints_.rubs_at(k) && !rests(k)) joints_.sign[k] = v_(k) > 0.0 ? 1 : -1;
-  if (!system_.before_change(t, y, arriving(met))) return false;
-  joints_.sign = sign;
-  joints_.rate_rounding = rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+      if (joints_.has_friction_at(k) && !is_at_rest(k)) joints_.sliding_direction[k] = v_(k) > 0.0 ? 1 : -1;
+  if (!system_.before_transition(t, y, find_arrivals(triggered))) return false;
+  joints_.sliding_direction = previous_direction;
+  joints_.rate_rounding = rate_rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
   std::optional<double> energy;
-  if (!impact(t, y, energy) || !grip(t, y, held)) return false;
-  // The loss of the rounds, and of the rates up to rounding that are taken from joints at rest after them.
+  if (!resolve_impacts(t, y, energy) || !resolve_holding(t, y, held)) return false;
+  // The loss of the rounds, and of rates up to rounding that are set to zero afterwards.
   if (energy) joints_.impact_loss += *energy - core_.energy(v_, step_).kinetic;
-  known_ = true;
-  return system_.after_change(t, y, arrived_, tolerance_.rtol, tolerance_.atol);
+  was_decided_ = true;
+  return system_.after_transition(t, y, arrivals_, tolerance_.rtol, tolerance_.atol);
 }
 
-// What holds gives way where nothing changes yet: at no time of its own. Where a joint rests at its stop, and nothing holds
-// it there, that is when it does.
-std::vector<System::Met> JointChanges::arriving(const std::vector<Event>& met) const {
-  std::vector<System::Met> found;
+// An exceeded holding force changes no velocity, so it has no arrival of its own. If a joint rests at its stop
+// without being held there, its arrival is that it comes to rest.
+std::vector<System::JointArrival> JointModeTransitions::find_arrivals(const std::vector<Event>& triggered) const {
+  std::vector<System::JointArrival> arrivals;
   for (int k = 0; k < core_.n; ++k)
-    if (is_into(k)) found.push_back({k, false, near_[k]});
-  for (const Event& event : met) {
+    if (approaches_stop(k)) arrivals.push_back({k, false, nearby_stop_[k]});
+  for (const Event& event : triggered) {
     const int k = event.coordinate;
-    if (event.of == Event::q_dot) found.push_back({k, true});
-    if (event.of != Event::q || is_into(k)) continue;
-    if (!rests(k))
-      found.push_back({k, false, near_[k]});
+    if (event.quantity == Event::q_dot) arrivals.push_back({k, true});
+    if (event.quantity != Event::q || approaches_stop(k)) continue;
+    if (!is_at_rest(k))
+      arrivals.push_back({k, false, nearby_stop_[k]});
     else if (!joints_.is_locked(k))
-      found.push_back({k, true});
+      arrivals.push_back({k, true});
   }
-  return found;
+  return arrivals;
 }
 
-bool JointChanges::hits(int k) const {
-  return std::any_of(arrived_.begin(), arrived_.end(), [&](const auto& of) { return of.coordinate == k && of.stop; });
+bool JointModeTransitions::was_reflected(int k) const {
+  return std::any_of(arrivals_.begin(), arrivals_.end(), [&](const auto& of) { return of.coordinate == k && of.stop; });
 }
 
-bool JointChanges::movable(Indices& at) {
-  if (!core_.responses(at, responses_)) return false;
-  Eigen::Index left = 0;
-  for (size_t i = 0; i < at.size(); ++i) {
-    const int k = at[i];
+bool JointModeTransitions::keep_movable(Indices& candidates) {
+  if (!core_.unit_force_responses(candidates, responses_)) return false;
+  Eigen::Index kept = 0;
+  for (size_t i = 0; i < candidates.size(); ++i) {
+    const int k = candidates[i];
     const auto column = static_cast<Eigen::Index>(i);
-    if (!(responses_(k, column) * core_.inertia_alone(k) > moves)) continue;
-    at[left] = k;
-    if (left != column) responses_.col(left) = responses_.col(column);
-    ++left;
+    if (!(responses_(k, column) * core_.joint_inertia(k) > min_mobility)) continue;
+    candidates[kept] = k;
+    if (kept != column) responses_.col(kept) = responses_.col(column);
+    ++kept;
   }
-  at.resize(left);
+  candidates.resize(kept);
   return true;
 }
 
-void JointChanges::scale(const Indices& at) {
-  const auto m = static_cast<Eigen::Index>(at.size());
+void JointModeTransitions::scale_responses(const Indices& candidates) {
+  const auto m = static_cast<Eigen::Index>(candidates.size());
   A_.resize(m, m), scale_.resize(m);
-  for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(at[i], i));
+  for (Eigen::Index i = 0; i < m; ++i) scale_(i) = 1.0 / std::sqrt(responses_(candidates[i], i));
   for (Eigen::Index i = 0; i < m; ++i)
-    for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(at[i], j);
+    for (Eigen::Index j = 0; j < m; ++j) A_(i, j) = scale_(i) * scale_(j) * responses_(candidates[i], j);
 }
 
-// What happens at the stops that joints are at, in the order in which it happens there (motion/impact.hpp). Joints that touch are
-// in it too: what pushes them is an impact. Friction is bounded and has no impulse, so that joints that stick are let go.
-bool JointChanges::impact(double t, Out y, std::optional<double>& energy) {
-  Indices at;
+// Resolve impacts at the nearby stops (motion/impact.hpp). Joints that touch take part, since they may be pushed.
+// Friction is bounded and has no impulse, so sticking joints are released.
+bool JointModeTransitions::resolve_impacts(double t, Out y, std::optional<double>& energy) {
+  Indices candidates;
   bool any = false;
   for (int k = 0; k < core_.n; ++k)
-    if (near_[k]) at.push_back(k), any |= is_into(k);
+    if (nearby_stop_[k]) candidates.push_back(k), any |= approaches_stop(k);
   if (!any) return true;
   energy = core_.energy(v_, step_).kinetic;
-  if (!system_.acceleration(t, held_)) return false;
+  if (!system_.acceleration(t, held_acceleration_)) return false;
   joints_.locked.clear();
-  const Indices touched = std::exchange(joints_.touch, Indices(core_.n, 0));
-  if (!system_.acceleration(t, a_) || !movable(at)) return false;
-  const auto m = static_cast<Eigen::Index>(at.size());
-  if (!m) return joints_.touch = touched, true;
+  const Indices previous_stop_side = std::exchange(joints_.stop_side, Indices(core_.n, 0));
+  if (!system_.acceleration(t, a_) || !keep_movable(candidates)) return false;
+  const auto m = static_cast<Eigen::Index>(candidates.size());
+  if (!m) return joints_.stop_side = previous_stop_side, true;
   const Vector& reach = joints_.table.reach;
-  // Back to the stop, by what holds others before or without it: a bounce that either way rises no further is none.
-  const auto returning = [&](int k) { return std::max(near_[k] * a_(k), near_[k] * held_(k)); };
-  const double fastest = v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
+  // Acceleration towards the stop, with or without the other holding forces. A bounce that does not rise in either
+  // case is suppressed.
+  const auto return_acceleration = [&](int k) {
+    return std::max(nearby_stop_[k] * a_(k), nearby_stop_[k] * held_acceleration_(k));
+  };
+  const double fastest_rate = v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
   ImpactProblem problem;
-  problem.A.resize(m, m), problem.g.resize(m), problem.restitution.resize(m), problem.at_rest.resize(m), problem.slow.resize(m);
+  problem.A.resize(m, m), problem.gap_rates.resize(m), problem.restitution.resize(m), problem.rest_speed.resize(m),
+      problem.min_bounce_speed.resize(m);
   for (Eigen::Index i = 0; i < m; ++i) {
-    const int k = at[i], side = -near_[k];
-    problem.g(i) = side * v_(k);
+    const int k = candidates[i], side = -nearby_stop_[k];
+    problem.gap_rates(i) = side * v_(k);
     problem.restitution(i) = joints_.table.restitution(k);
-    problem.at_rest(i) = std::isfinite(rest_(k)) ? rest_(k) : rounding * fastest * reach(k);
-    // A bounce has to rise higher than the joint is off its stop, or it is not seen to come back.
-    const double rise = std::max(rise_ * reach(k), seen * std::abs(coordinates(k) - joints_.stop_at(k, near_[k])));
-    problem.slow(i) = std::sqrt(2 * std::max(returning(k), 0.0) * rise);
-    for (Eigen::Index j = 0; j < m; ++j) problem.A(i, j) = side * -near_[at[j]] * responses_(k, j);
+    problem.rest_speed(i) = std::isfinite(rest_speed_(k)) ? rest_speed_(k) : rate_rounding * fastest_rate * reach(k);
+    // A bounce must exceed the present distance from the stop, or its return cannot be detected.
+    const double min_rise = std::max(
+        min_rise_ * reach(k), stop_offset_factor * std::abs(coordinates(k) - joints_.stop_at(k, nearby_stop_[k])));
+    problem.min_bounce_speed(i) = std::sqrt(2 * std::max(return_acceleration(k), 0.0) * min_rise);
+    for (Eigen::Index j = 0; j < m; ++j) problem.A(i, j) = side * -nearby_stop_[candidates[j]] * responses_(k, j);
   }
-  std::vector<char> is_hit(at.size(), 0);
+  std::vector<char> was_hit(candidates.size(), 0);
   Vector step = Vector::Zero(core_.n);
   const auto apply = [&](const Indices& stops, const Vector& impulses, double restitution) {
     const auto count = static_cast<Eigen::Index>(stops.size());
-    Indices struck;
+    Indices struck_joints;
     Vector x(count);
     step_.setZero();
     for (Eigen::Index j = 0; j < count; ++j) {
-      const int i = stops[j], k = at[i];
-      struck.push_back(k);
-      x(j) = -near_[k] * impulses(i);
+      const int i = stops[j], k = candidates[i];
+      struck_joints.push_back(k);
+      x(j) = -nearby_stop_[k] * impulses(i);
       step_ += x(j) * responses_.col(i);
-      if (impulses(i) > 0.0 && !is_hit[i] && !touched[k]) arrived_.push_back({k, false, near_[k]});
-      is_hit[i] |= impulses(i) > 0.0;
+      if (impulses(i) > 0.0 && !was_hit[i] && !previous_stop_side[k]) arrivals_.push_back({k, false, nearby_stop_[k]});
+      was_hit[i] |= impulses(i) > 0.0;
     }
     step += step_;
-    return system_.at_impact(step_, struck, responses_(Eigen::all, stops), x, restitution);
+    return system_.at_impact(step_, struck_joints, responses_(Eigen::all, stops), x, restitution);
   };
   Vector gap_rates;
   if (!resolve_impact(problem, apply, gap_rates)) return false;
-  system_.push(y, step);
-  if (!take_state(t, y)) return false;
-  rest_ = 10 * rounding * std::max(fastest, step.cwiseQuotient(reach).lpNorm<Eigen::Infinity>()) * reach;
+  system_.add_velocity(y, step);
+  if (!sync_state(t, y)) return false;
+  rest_speed_ =
+      10 * rate_rounding * std::max(fastest_rate, step.cwiseQuotient(reach).lpNorm<Eigen::Infinity>()) * reach;
   for (Eigen::Index i = 0; i < m; ++i) {
-    const int k = at[i];
-    const double towards = returning(k), off = gap_rates(i);
-    if (off == 0.0) {
-      joints_.touch[k] = near_[k], rest_(k) = infinity;
-      if (!touched[k]) note(t, k, JointChange::touches, near_[k]);
-    } else if (is_hit[i] || touched[k]) {
-      note(t, k, touched[k] ? JointChange::leaves : JointChange::bounces, near_[k]);
-      if (towards > 0.0) flight = std::min(flight, 2 * off / towards);
+    const int k = candidates[i];
+    const double return_rate = return_acceleration(k), offset = gap_rates(i);
+    if (offset == 0.0) {
+      joints_.stop_side[k] = nearby_stop_[k], rest_speed_(k) = infinity;
+      if (!previous_stop_side[k]) record(t, k, JointTransition::touches, nearby_stop_[k]);
+    } else if (was_hit[i] || previous_stop_side[k]) {
+      record(t, k, previous_stop_side[k] ? JointTransition::leaves : JointTransition::bounces, nearby_stop_[k]);
+      if (return_rate > 0.0) first_bounce_duration = std::min(first_bounce_duration, 2 * offset / return_rate);
     }
-    near_[k] = joints_.touch[k];
+    nearby_stop_[k] = joints_.stop_side[k];
   }
   return true;
 }
 
-// Gauss' principle: of the accelerations that the loops and the stops allow, the one nearest in the metric of D' to that
-// without what holds, less what friction takes, which is the problem of least forces between their bounds.
-bool JointChanges::grip(double t, Out y, const Indices& before) {
-  Indices at, locked;
-  const Indices sign = joints_.sign, touch = joints_.touch;
+// Gauss' principle: choose the accelerations allowed by loops and stops that are closest, in the metric of D', to
+// those without holding forces, minus what friction takes. In forces this is a minimum-norm problem between bounds.
+bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previously_locked) {
+  Indices candidates, locked;
+  const Indices previous_direction = joints_.sliding_direction, previous_stop = joints_.stop_side;
   joints_.locked.clear();
   for (int k = 0; k < core_.n; ++k) {
-    const bool rubs = joints_.rubs_at(k);
-    const bool touches = near_[k] && rests(k);
-    joints_.touch[k] = touches ? near_[k] : 0;
-    joints_.sign[k] = rubs && !rests(k) ? (v_(k) > 0.0 ? 1 : -1) : 0;
-    if (touches || (rubs && rests(k))) at.push_back(k);
+    const bool has_friction = joints_.has_friction_at(k);
+    const bool is_touching = nearby_stop_[k] && is_at_rest(k);
+    joints_.stop_side[k] = is_touching ? nearby_stop_[k] : 0;
+    joints_.sliding_direction[k] = has_friction && !is_at_rest(k) ? (v_(k) > 0.0 ? 1 : -1) : 0;
+    if (is_touching || (has_friction && is_at_rest(k))) candidates.push_back(k);
   }
-  if (!at.empty()) {
+  if (!candidates.empty()) {
     if (!system_.acceleration(t, a_)) return false;
-    // Where the loops leave a joint no way, as a slide at its dead centre, they turn it round or it does nothing.
-    const double fastest = a_.cwiseQuotient(joints_.table.reach).lpNorm<Eigen::Infinity>();
-    for (int k : at)
-      if (joints_.rubs_at(k) && std::abs(a_(k)) > exactly * fastest * joints_.table.reach(k))
-        joints_.sign[k] = a_(k) > 0.0 ? 1 : -1;
-    const Indices all = at, touching = joints_.touch;
-    if (!movable(at)) return false;
-    for (int k : all) joints_.touch[k] = 0;
-    for (int k : at) joints_.sign[k] = 0, joints_.touch[k] = touching[k];
+    // If the loops block a joint (a slide at its dead centre), it either reverses or stays at rest.
+    const double fastest_rate = a_.cwiseQuotient(joints_.table.reach).lpNorm<Eigen::Infinity>();
+    for (int k : candidates)
+      if (joints_.has_friction_at(k) &&
+          std::abs(a_(k)) > acceleration_tolerance * fastest_rate * joints_.table.reach(k))
+        joints_.sliding_direction[k] = a_(k) > 0.0 ? 1 : -1;
+    const Indices all = candidates, touching = joints_.stop_side;
+    if (!keep_movable(candidates)) return false;
+    for (int k : all) joints_.stop_side[k] = 0;
+    for (int k : candidates) joints_.sliding_direction[k] = 0, joints_.stop_side[k] = touching[k];
   }
-  const auto m = static_cast<Eigen::Index>(at.size());
+  const auto m = static_cast<Eigen::Index>(candidates.size());
   if (m) {
-    scale(at);
+    scale_responses(candidates);
     b_.resize(m), low_.resize(m), high_.resize(m);
-    for (Eigen::Index i = 0; i < m; ++i) b_(i) = scale_(i) * a_(at[i]);
-    double most = 0.0;  // that friction alone would accelerate
-    for (Eigen::Index i = 0; i < m; ++i) most = std::max(most, joints_.table.friction(at[i]) / scale_(i));
-    // What rounding makes of the accelerations keeps whatever is held.
-    core_.acceleration_rounding(at, responses_, system_.acting(v_), a_, rounding_);
+    for (Eigen::Index i = 0; i < m; ++i) b_(i) = scale_(i) * a_(candidates[i]);
+    double max_friction_acceleration = 0.0;  // that friction alone would cause
+    for (Eigen::Index i = 0; i < m; ++i)
+      max_friction_acceleration =
+          std::max(max_friction_acceleration, joints_.table.friction(candidates[i]) / scale_(i));
+    // Accelerations within rounding keep a joint locked.
+    core_.acceleration_rounding(candidates, responses_, system_.applied_force(v_), a_, rounding_);
     rounding_ = rounding_.cwiseProduct(scale_);
-    const double size = std::max({b_.lpNorm<Eigen::Infinity>(), negligible * most, rounding_.maxCoeff(), 1e-300});
-    const double weaker = slips_ ? gives : 0.0;
-    b_ /= size;
-    // Rows that follow from others have accelerations that do, but for rounding, unless they do so here alone.
+    const double scale = std::max({b_.lpNorm<Eigen::Infinity>(), friction_scale_factor * max_friction_acceleration,
+                                   rounding_.maxCoeff(), 1e-300});
+    const double reduction = holding_was_exceeded_ ? holding_reduction : 0.0;
+    b_ /= scale;
+    // Dependent rows have dependent accelerations, up to rounding. Remove the contradiction unless it is a real one.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
     const auto& values = eigen.eigenvalues();
     const auto project = [&](double tolerance) {
-      for (Eigen::Index k = 0; k < m && values(k) <= dependent * values(m - 1); ++k) {
-        const double beyond = eigen.eigenvectors().col(k).dot(b_);
-        if (std::abs(beyond) <= tolerance) b_ -= beyond * eigen.eigenvectors().col(k);
+      for (Eigen::Index k = 0; k < m && values(k) <= dependent_row_tolerance * values(m - 1); ++k) {
+        const double component = eigen.eigenvectors().col(k).dot(b_);
+        if (std::abs(component) <= tolerance) b_ -= component * eigen.eigenvectors().col(k);
       }
     };
-    project(std::max({exactly, rounded * most / size, rounding_.norm() / size}));
+    project(std::max({acceleration_tolerance, friction_rounding_factor * max_friction_acceleration / scale,
+                      rounding_.norm() / scale}));
     for (Eigen::Index i = 0; i < m; ++i) {
-      const double low = joints_.lower_force(at[i]) / (scale_(i) * size), high = joints_.upper_force(at[i]) / (scale_(i) * size);
-      const double less = std::min(weaker, 0.5 * (high - low));
-      low_(i) = low + less, high_(i) = high - less;
+      const double lower = joints_.lower_force(candidates[i]) / (scale_(i) * scale),
+                   upper = joints_.upper_force(candidates[i]) / (scale_(i) * scale);
+      const double reduction_here = std::min(reduction, 0.5 * (upper - lower));
+      low_(i) = lower + reduction_here, high_(i) = upper - reduction_here;
     }
-    // Without a solution, stops push against each other: the nearest accelerations that all of them allow are taken.
-    if (!least_in_box(A_, b_, low_, high_, x_)) {
+    // Without a solution, stops push against each other. Use the closest accelerations that satisfy all of them.
+    if (!minimize_in_box(A_, b_, low_, high_, x_)) {
       project(infinity);
-      if (!least_in_box(A_, b_, low_, high_, x_)) return false;
+      if (!minimize_in_box(A_, b_, low_, high_, x_)) return false;
     }
-    const Vector row = A_ * x_ + b_;  // accelerations
+    const Vector acceleration = A_ * x_ + b_;
     for (Eigen::Index i = 0; i < m; ++i) {
-      const int k = at[i];
-      const double room = row(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);  // or it: one of them is zero
-      if (!(std::abs(row(i)) > std::max({exactly, room, rounding_(i) / size}))) {
+      const int k = candidates[i];
+      // the slack or the acceleration is zero
+      const double slack = acceleration(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);
+      if (!(std::abs(acceleration(i)) > std::max({acceleration_tolerance, slack, rounding_(i) / scale}))) {
         locked.push_back(k);
         continue;
       }
-      if (!hits(k)) {
-        arrived_.push_back({k, true});
-        if (near_[k]) arrived_.push_back({k, false, near_[k]});
+      if (!was_reflected(k)) {
+        arrivals_.push_back({k, true});
+        if (nearby_stop_[k]) arrivals_.push_back({k, false, nearby_stop_[k]});
       }
-      joints_.touch[k] = 0;
-      if (joints_.rubs_at(k)) joints_.sign[k] = row(i) > 0.0 ? 1 : -1;
+      joints_.stop_side[k] = 0;
+      if (joints_.has_friction_at(k)) joints_.sliding_direction[k] = acceleration(i) > 0.0 ? 1 : -1;
     }
   }
   joints_.lock(locked, coordinates);
-  joints_.idle.clear();
+  joints_.immobile.clear();
   for (int k = 0; k < core_.n; ++k) {
-    const bool holds = among(locked, k);
-    if (joints_.touch[k] && !touch[k]) arrived_.push_back({k, false, joints_.touch[k]});
-    if (joints_.touch[k] && !touch[k]) note(t, k, JointChange::touches, joints_.touch[k]);
-    if (!joints_.touch[k] && touch[k]) note(t, k, JointChange::leaves, touch[k]);
-    if (joints_.sign[k] && joints_.sign[k] != sign[k]) note(t, k, JointChange::slides, joints_.sign[k]);
-    if (holds && !among(before, k) && !joints_.touch[k]) note(t, k, JointChange::sticks, 0);
-    if (joints_.rubs_at(k) && !joints_.sign[k] && !holds) joints_.idle.push_back(k);
+    const bool is_locked = contains(locked, k);
+    if (joints_.stop_side[k] && !previous_stop[k]) arrivals_.push_back({k, false, joints_.stop_side[k]});
+    if (joints_.stop_side[k] && !previous_stop[k]) record(t, k, JointTransition::touches, joints_.stop_side[k]);
+    if (!joints_.stop_side[k] && previous_stop[k]) record(t, k, JointTransition::leaves, previous_stop[k]);
+    if (joints_.sliding_direction[k] && joints_.sliding_direction[k] != previous_direction[k])
+      record(t, k, JointTransition::slides, joints_.sliding_direction[k]);
+    if (is_locked && !contains(previously_locked, k) && !joints_.stop_side[k]) record(t, k, JointTransition::sticks, 0);
+    if (joints_.has_friction_at(k) && !joints_.sliding_direction[k] && !is_locked) joints_.immobile.push_back(k);
   }
   bool changed;
-  if (!locked.empty() && !system_.keep_locked(y, 0.0, changed)) return false;
-  if (!take_state(t, y)) return false;
-  system_.go_on(t, y);
+  if (!locked.empty() && !system_.correct_locked_joints(y, 0.0, changed)) return false;
+  if (!sync_state(t, y)) return false;
+  system_.resume(t, y);
   return true;
 }
 

@@ -1,5 +1,5 @@
-// Which joints slide, stick and touch from an instant on, and what an impact there does: two convex problems in the
-// metric of D', over velocities and over accelerations.
+// Transitions of joint modes at an instant: impacts, and the choice of which joints slide, stick or touch. Both are
+// convex problems in the metric of D', over velocities and over accelerations.
 #pragma once
 
 #include <optional>
@@ -8,44 +8,47 @@
 
 namespace ckc {
 
-class JointChanges {
+class JointModeTransitions {
  public:
-  // `rise`: rad, or of the mechanism's size: a bounce that would rise no further is none.
-  JointChanges(System& system, double rise, const Tolerance& tolerance);
+  // `min_rise`: rad, or relative to the mechanism's size. Bounces that rise less are suppressed.
+  JointModeTransitions(System& system, double min_rise, const Tolerance& tolerance);
 
-  void begin();  // a motion begins
-  // Decide, at the core's exact state, that of y, from what was met there; `within`: s, how closely events are located.
-  // A velocity that jumps is changed in y. False where that cannot be: the system's trouble says why, or none does.
-  bool decide(double t, Out y, const std::vector<Event>& met, double within);
-  Vector coordinates;   // (n), of the state that was decided about
-  double flight = 0.0;  // s: how long the first bounce from there will last, infinite where there is none
+  void reset();  // at the start of a motion
+  // Update the joint modes at the core's state, that of y, after these events. `time_tolerance`: s, of the events'
+  // times. If velocities jump, y is changed. False if it fails: the system's `failure` says why; if it is `none`, no
+  // contact forces exist.
+  bool update(double t, Out y, const std::vector<Event>& triggered, double time_tolerance);
+  Vector coordinates;                  // (n), of the state of the update
+  double first_bounce_duration = 0.0;  // s, until the first bounce returns; infinite if there is none
 
  private:
-  bool take_state(double t, Out y);  // and close it in y
-  // What comes to a stop, or to rest, where that was met.
-  std::vector<System::Met> arriving(const std::vector<Event>& met) const;
-  bool impact(double t, Out y, std::optional<double>& energy);  // the kinetic energy before it, J; none without an impact
-  bool grip(double t, Out y, const Indices& before);  // `before`: what stuck or touched when this instant began
-  // Leave in `at`, and in the columns of responses_, the coordinates that the loops let move; false where J has lost rank.
-  bool movable(Indices& at);
-  void scale(const Indices& at);  // A_, free of units: what unit forces make of the coordinates that they are on
-  bool rests(int k) const { return std::abs(v_(k)) <= rest_(k); }
-  bool is_into(int k) const { return near_[k] * v_(k) > 0.0 && !rests(k); }  // its stop
-  bool hits(int k) const;  // has just been thrown back by its stop, with a speed that follows from a restitution
-  void note(double t, int k, JointChange::What what, int direction) {
-    joints_.changes.push_back({t, k, what, direction});
+  bool sync_state(double t, Out y);  // and write the projected state to y
+  // Joints that come to rest or reach a stop at this instant.
+  std::vector<System::JointArrival> find_arrivals(const std::vector<Event>& triggered) const;
+  // `energy`: kinetic energy before an impact, J; none without an impact
+  bool resolve_impacts(double t, Out y, std::optional<double>& energy);
+  bool resolve_holding(double t, Out y, const Indices& previously_locked);
+  // Remove coordinates from `candidates` that the loops do not allow to move, and their columns from responses_.
+  // False if J has lost rank.
+  bool keep_movable(Indices& candidates);
+  void scale_responses(const Indices& candidates);  // computes A_, the dimensionless responses to unit forces
+  bool is_at_rest(int k) const { return std::abs(v_(k)) <= rest_speed_(k); }
+  bool approaches_stop(int k) const { return nearby_stop_[k] * v_(k) > 0.0 && !is_at_rest(k); }
+  bool was_reflected(int k) const;  // by its stop, with the speed that restitution requires
+  void record(double t, int k, JointTransition::Kind kind, int direction) {
+    joints_.transitions.push_back({t, k, kind, direction});
   }
 
   System& system_;
   Core& core_;
   Joints& joints_;
-  const double rise_;
+  const double min_rise_;
   const Tolerance& tolerance_;
-  bool known_ = false;  // whether a decision was made since the begin
-  Vector v_, a_, held_, rest_, step_;
-  Indices near_;        // (n): the stop that a joint is at, as `touch`
-  std::vector<System::Met> arrived_;  // what is as it is now because it has come there now
-  bool slips_ = false;  // what holds has given way
+  bool was_decided_ = false;  // since the start
+  Vector v_, a_, held_acceleration_, rest_speed_, step_;
+  Indices nearby_stop_;                         // (n): side of the stop that a joint is at, as `stop_side`
+  std::vector<System::JointArrival> arrivals_;  // joints that have arrived in their new mode at this instant
+  bool holding_was_exceeded_ = false;           // one of the events was an exceeded holding force
   Matrix responses_, A_;
   Vector b_, low_, high_, scale_, x_, rounding_;
 };

@@ -6,73 +6,76 @@
 
 namespace ckc {
 
-constexpr double switch_margin = 0.03;  // of |J|: phi_z's least singular value where an uncontrolled run looks for a better q;
-constexpr double fallen = 0.7;          // it looks again at so much of the margin at which none was found,
-constexpr double poor = 1e-3;           // and from there on at every step
-constexpr double clearly = 2.0;         // times as far from singular: a better q
-constexpr double weight = 3.0, patience = 100.0;  // of a refused step, in steps as before it; until none is tried
+// smallest singular value of phi_z over |J| below which a better q is searched for
+constexpr double partition_search_margin = 0.03;
+constexpr double search_again_ratio = 0.7;  // search again at this fraction of the margin at which none was found
+constexpr double min_margin = 1e-3;         // below it, search at every step
+constexpr double min_margin_gain = 2.0;     // a better q must increase the margin by this factor
+// weight of a rejected step, in steps of the usual size; sum at which steps are given up
+constexpr double rejection_weight = 3.0, max_rejection_balance = 100.0;
 constexpr double rounding = 8 * std::numeric_limits<double>::epsilon();
-constexpr double gone = 100.0;  // epsilons after which w is no more
+constexpr double w_lifetime = 100.0;  // in epsilon: after that w is zero
 
-LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double slack)
+LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double rhs_slack)
     : System(core_, control_, 2 * core_.d),
       epsilon_(epsilon),
       tolerance_(tolerance),
-      slack_(slack),
+      rhs_slack_(rhs_slack),
       actual_(actual),
-      own_{core.q, core.z},
-      alarm_(switch_margin),
+      fixed_partition_{core.q, core.z},
+      search_margin_(partition_search_margin),
       predictor_(core, epsilon),
-      closing_(core) {
-  const int m = core.rows.closure.rows;
-  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m), z_.setZero(core.z.size());
+      closure_solver_(core) {
+  const int m = core.constraints.closure.rows;
+  q_tree_.setZero(core.tree.nq), step_.setZero(core.n), residual_.setZero(m), a_tree_.setZero(core.n), w0_.setZero(m),
+      z_.setZero(core.z.size());
 }
 
 void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
-  if (core.q != own_.q) core.split(own_.q, own_.z);
-  refusals_ = 0, balance_ = 0.0, closing_.expected = 0;
-  elimination.start(core);
-  t_start_ = accepted_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
-  core.set(q_tree);
-  core.reduce();
-  begin(q_tree);
+  if (core.q != fixed_partition_.q) core.set_partition(fixed_partition_.q, fixed_partition_.z);
+  disagreements_ = 0, rejection_balance_ = 0.0, closure_solver_.expected_steps = 0;
+  elimination.reset(core);
+  t_start_ = accepted_t_ = t, w0_ = w_start, on_manifold_ = w0_.isZero(0);
+  core.set_configuration(q_tree);
+  core.compute_rho();
+  reset_coordinates(q_tree);
   chart_numbers(y);
   for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
 }
 
-void LevelSet::begin(In q_tree) {
-  chart_.start(core, q_tree);
-  predictor_.start(core, q_tree);
-  anchor_ = arrived_ = q_tree;
-  alarm_ = switch_margin;
-  new_partition();
+void LevelSet::reset_coordinates(In q_tree) {
+  chart_.reset(core, q_tree);
+  predictor_.reset(core, q_tree);
+  accepted_q_tree_ = last_q_tree_ = q_tree;
+  search_margin_ = partition_search_margin;
+  partition_changed();
 }
 
 void LevelSet::chart_numbers(Out y) { chart_.numbers(core, core.q_tree, y.head(core.d)); }
 
-void LevelSet::level(double t) {
+void LevelSet::update_w(double t) {
   if (on_manifold_)
     w.setZero();
   else
     w = w0_ * std::exp(-(t - t_start_) / epsilon_);
 }
 
-bool LevelSet::state(double t, In y, double tolerance) {
+bool LevelSet::project_state(double t, In y, double tolerance) {
   const int d = core.d;
-  level(t);
+  update_w(t);
   predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
-  if (!close(tolerance)) {
+  if (!project_from_predicted(tolerance)) {
     predict_from_accepted();
     predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
-    if (!close(tolerance)) return false;
+    if (!project_from_predicted(tolerance)) return false;
   }
-  if (chart_.plain())
+  if (chart_.is_trivial())
     q = y.head(d);
   else
-    for (int k = 0; k < d; ++k) q(k) = core.q_tree(core.tree.place[core.q[k]]);
-  core.reduce();
+    for (int k = 0; k < d; ++k) q(k) = core.q_tree(core.tree.q_index[core.q[k]]);
+  core.compute_rho();
   q_dot = y.tail(d);
-  core.velocity(q_dot, v_tree);
+  core.multiply_rho(q_dot, v_tree);
   velocity = v_tree;
   if (!on_manifold_) {
     core.solve_z(w, z_);
@@ -83,107 +86,109 @@ bool LevelSet::state(double t, In y, double tolerance) {
   return true;
 }
 
-bool LevelSet::at_start(double t, In y) {
-  if (!exact(t, y)) return false;
-  arrived_ = core.q_tree;
-  elimination.begin(core, v_tree);
+bool LevelSet::sync_core_at_start(double t, In y) {
+  if (!sync_core(t, y)) return false;
+  last_q_tree_ = core.q_tree;
+  elimination.check_start(core, v_tree);
   return true;
 }
 
-// A state next to where phi_z is singular has to be closed exactly, or nothing after it can be.
-bool LevelSet::at_last(double t, In y) {
-  if (margin() < poor && !exact(t, y)) return false;
-  arrived_ = core.q_tree;
-  if (elimination.is_due()) elimination.remember(core.q_tree, v_tree, acting(v_tree));
+// Near a singular phi_z the state must be projected exactly, or later states cannot be.
+bool LevelSet::sync_core_at_last_rhs(double t, In y) {
+  if (coordinate_margin() < min_margin && !sync_core(t, y)) return false;
+  last_q_tree_ = core.q_tree;
+  if (elimination.is_due()) elimination.remember_state(core.q_tree, v_tree, applied_force(v_tree));
   return true;
 }
 
-bool LevelSet::shows(In y, int k, bool rate, double& value) const {
+bool LevelSet::read_from_state(In y, int k, bool rate, double& value) const {
   const auto at = std::find(core.q.begin(), core.q.end(), k);
-  if (at == core.q.end() || !(rate || chart_.plain())) return false;
+  if (at == core.q.end() || !(rate || chart_.is_trivial())) return false;
   return value = y((rate ? core.d : 0) + (at - core.q.begin())), true;
 }
 
-bool LevelSet::close(double tolerance) {
-  closing_.corrections = 0;
-  const bool closed = closing_.close(q_tree_, w, tolerance, to_rounding_ || refusals_ > 1);
-  counts.newton += closing_.corrections, counts.factorizations += closing_.corrections;
+bool LevelSet::project_from_predicted(double tolerance) {
+  closure_solver_.newton_steps = 0;
+  const bool closed = closure_solver_.project(q_tree_, w, tolerance, project_to_rounding_ || disagreements_ > 1);
+  counts.newton += closure_solver_.newton_steps, counts.factorizations += closure_solver_.newton_steps;
   return closed;
 }
 
 bool LevelSet::rhs(double t, In y, Out y_dot) {
   const int d = core.d;
-  if (!finite(y)) return fails(Trouble::infinite);
-  if (!state(t, y, refusals_ || to_rounding_ ? tolerance_ : std::max(tolerance_, slack_))) return fails(Trouble::open);
+  if (!finite(y)) return fail(RhsFailure::not_finite);
+  if (!project_state(t, y, disagreements_ || project_to_rounding_ ? tolerance_ : std::max(tolerance_, rhs_slack_)))
+    return fail(RhsFailure::loops_open);
   core.set_velocity(v_tree);
-  if (!act(t)) return false;
+  if (!compute_control(t)) return false;
   counts.factorizations += 2;  // phi_z and D
-  if (chart_.plain())
+  if (chart_.is_trivial())
     y_dot.head(d) = q_dot;
   else
-    chart_.rate(core, core.q_tree, q_dot, y_dot.head(d));
-  // On the manifold eq. 6 is eq. 1 at rho q_dot.
-  const Vector& force = acting(v_tree);
-  const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.written && !locked;
-  of_tree_ = compiled && core.written_acceleration(core.q_tree, v_tree, force, uncorrected_, a_tree_);
-  if (compiled && !of_tree_) ++counts.pivoted;
-  if (!of_tree_ && (locked || (on_manifold_ && core.uses_levels()))) {
-    if (!eq_1(v_tree, uncorrected_, a_tree_)) return false;
-    of_tree_ = true;
+    chart_.numbers_rate(core, core.q_tree, q_dot, y_dot.head(d));
+  // On the manifold eq. 6 equals eq. 1 at rho q_dot.
+  const Vector& force = applied_force(v_tree);
+  const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.compiled && !locked;
+  has_tree_acceleration_ =
+      compiled && core.compiled_acceleration(core.q_tree, v_tree, force, zero_correction_, a_tree_);
+  if (compiled && !has_tree_acceleration_) ++counts.general_rhs;
+  if (!has_tree_acceleration_ && (locked || (on_manifold_ && core.uses_mass_levels()))) {
+    if (!acceleration_with_held_joints(v_tree, zero_correction_, a_tree_)) return false;
+    has_tree_acceleration_ = true;
   }
-  if (of_tree_)
+  if (has_tree_acceleration_)
     for (int k = 0; k < d; ++k) y_dot(d + k) = a_tree_(core.q[k]);
   else if (actual_ && !on_manifold_)
     core.actual_acceleration(force, q_dot, y_dot.tail(d));
   else
     core.reduced_acceleration(force, y_dot.tail(d));
-  return finite(y_dot) || fails(Trouble::infinite);
+  return finite(y_dot) || fail(RhsFailure::not_finite);
 }
 
 bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
-  to_rounding_ = true;  // what the slack of the loops leaves open is far more than a difference moves
+  project_to_rounding_ = true;  // the slack of the right-hand side is much larger than a difference step
   const bool exists = System::jacobian(t, y, jacobian, evaluations);
-  to_rounding_ = false;
+  project_to_rounding_ = false;
   return exists;
 }
 
-// Of eq. 1 at q'(q) and v' = rho(q) q_dot: d q' / d q = rho, d v' / d q = rho_dot but for a free root, whose axes turn,
-// d v' / d q_dot = rho.
+// Derivative of eq. 1 at q'(q) and v' = rho(q) q_dot: dq'/dq = rho, dv'/dq_dot = rho, and dv'/dq = rho_dot (plus a
+// bracket term for free roots).
 bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   const int d = core.d, n = core.n;
-  if (!finite(y) || !state(t, y, tolerance_)) return false;
+  if (!finite(y) || !project_state(t, y, tolerance_)) return false;
   core.set_velocity(v_tree);
-  if (!act(t) || !slopes(core.q_tree, v_tree, uncorrected_, by_q_, by_v_)) return false;
-  core.jacobian_rate(v_tree);
+  if (!compute_control(t) || !acceleration_derivatives(core.q_tree, v_tree, zero_correction_)) return false;
+  core.compute_J_dot(v_tree);
   rho_dot_.resize(n, d);
   for (int k = 0; k < d; ++k) {
-    unit_.setUnit(d, k);
-    core.rho_dot_times(unit_, rho_dot_.col(k));
+    unit_q_dot_.setUnit(d, k);
+    core.multiply_rho_dot(unit_q_dot_, rho_dot_.col(k));
   }
   if (!core.tree.roots.empty()) {
-    const Matrix turned = core.tree.brackets(v_tree) * core.rho;
-    for (int k = 0; k < d; ++k) {  // J x = J turned, x of z alone
-      residual_.noalias() = core.rows.J * turned.col(k);
-      core.z_step(residual_, step_);
+    const Matrix rotated = core.tree.bracket_matrix(v_tree) * core.rho;
+    for (int k = 0; k < d; ++k) {  // J x = J rotated.col(k), x in z only
+      residual_.noalias() = core.constraints.J * rotated.col(k);
+      core.closure_step_in_z(residual_, step_);
       rho_dot_.col(k) -= step_;
     }
   }
   jacobian.setZero(2 * d, 2 * d);
   jacobian.topRightCorner(d, d).setIdentity();
   for (int k = 0; k < d; ++k) {
-    const auto row = by_q_.row(core.q[k]), row_v = by_v_.row(core.q[k]);
+    const auto row = eq_1_.by_q.row(core.q[k]), row_v = eq_1_.by_v.row(core.q[k]);
     jacobian.row(d + k).head(d).noalias() = row * core.rho;
     jacobian.row(d + k).head(d).noalias() += row_v * rho_dot_;
     jacobian.row(d + k).tail(d).noalias() = row_v * core.rho;
   }
-  if (!chart_.plain()) chart_.jacobian(core, core.q_tree, q_dot, jacobian);
+  if (!chart_.is_trivial()) chart_.transform_jacobian(core, core.q_tree, q_dot, jacobian);
   return jacobian.allFinite();
 }
 
-void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
+void LevelSet::rate_pairs(std::vector<std::pair<int, int>>& of) const {
   of.clear();
-  const Indices& single = core.tree.single;
+  const Indices& single = core.tree.single_dof;
   for (int k = 0; k < core.d; ++k)
     if (std::binary_search(single.begin(), single.end(), core.q[k])) of.emplace_back(k, core.d + k);
 }
@@ -191,45 +196,45 @@ void LevelSet::rates(std::vector<std::pair<int, int>>& of) const {
 bool LevelSet::tree_acceleration(In f, Out a) const {
   if (!on_manifold_) return false;
   const auto q_ddot = f.tail(core.d);
-  if (!of_tree_) return core.tree_acceleration(q_ddot, a), true;
-  a = a_tree_;  // at another q_ddot than f's, which an implicit method asks for
+  if (!has_tree_acceleration_) return core.tree_acceleration(q_ddot, a), true;
+  a = a_tree_;  // implicit methods ask for another q_ddot than that of f
   for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
   return true;
 }
 
-void LevelSet::push(Out y, In v) const {
+void LevelSet::add_velocity(Out y, In v) const {
   for (int k = 0; k < core.d; ++k) y(core.d + k) += v(core.q[k]);
 }
 
-void LevelSet::shift(Out y, In step) const {
-  if (!chart_.plain()) return;
+void LevelSet::add_displacement(Out y, In step) const {
+  if (!chart_.is_trivial()) return;
   for (int k = 0; k < core.d; ++k) y(k) += step(core.q[k]);
 }
 
-void LevelSet::go_on(double t, Out y) {
-  begin(core.q_tree);
+void LevelSet::resume(double t, Out y) {
+  reset_coordinates(core.q_tree);
   chart_numbers(y);
-  accepted_ = t;
+  accepted_t_ = t;
 }
 
 bool LevelSet::return_to_accepted() {
-  ++refusals_, balance_ += weight;
-  if (balance_ > patience) {
-    if (!elimination.give_up(core)) return fails(Trouble::vague);
-    balance_ = 0.0;  // by the other elimination the steps may be good
+  ++disagreements_, rejection_balance_ += rejection_weight;
+  if (rejection_balance_ > max_rejection_balance) {
+    if (!elimination.disable_compiled_elimination(core)) return fail(RhsFailure::z_inaccurate);
+    rejection_balance_ = 0.0;  // steps may succeed with the other elimination
   }
-  alarm_ = std::numeric_limits<double>::infinity();
+  search_margin_ = std::numeric_limits<double>::infinity();
   predict_from_accepted();
   return true;
 }
 
 void LevelSet::predict_from_accepted() {
-  core.set(anchor_);
-  core.reduce();
-  predictor_.start(core, anchor_);
+  core.set_configuration(accepted_q_tree_);
+  core.compute_rho();
+  predictor_.reset(core, accepted_q_tree_);
 }
 
-void LevelSet::whole(In f, Out x, Out x_dot) const {
+void LevelSet::full_motion(In f, Out x, Out x_dot) const {
   core.tree.configuration_rate(core.q_tree, velocity, x_dot.head(core.tree.nq));
   if (on_manifold_) {
     x << core.q_tree, velocity;
@@ -240,66 +245,68 @@ void LevelSet::whole(In f, Out x, Out x_dot) const {
   }
 }
 
-// y is rounded as its largest number is, a crank's angle after many turns, and z follows it: an angle that passes zero is
-// not known better. What a nearly singular phi_z makes of that is not rounding.
+// y is rounded relative to its largest number, such as a crank's angle after many turns, and z depends on it. An
+// angle near zero is not known better. Errors amplified by a nearly singular phi_z are not rounding.
 void LevelSet::add_rounding(In x, Out scale) const {
   const Vector& units = core.scales.columns;
   double largest = 0.0;
-  for (int k : core.tree.single) largest = std::max(largest, std::abs(x(core.tree.place[k])) / units(k));
-  for (int k : core.tree.single) scale(core.tree.place[k]) += rounding * largest * units(k);
-  if (on_manifold_) scale.tail(core.n) += rounding * x.tail(core.n).cwiseQuotient(units).lpNorm<Eigen::Infinity>() * units;
+  for (int k : core.tree.single_dof) largest = std::max(largest, std::abs(x(core.tree.q_index[k])) / units(k));
+  for (int k : core.tree.single_dof) scale(core.tree.q_index[k]) += rounding * largest * units(k);
+  if (on_manifold_)
+    scale.tail(core.n) += rounding * x.tail(core.n).cwiseQuotient(units).lpNorm<Eigen::Infinity>() * units;
 }
 
-// Off the manifold eq. 8 is another model in other q (z_dot alone closes the loops), so there q stays.
-Accepted LevelSet::accept(double t, Out y, double here) {
-  anchor_ = arrived_;
-  elimination.accept(core);
-  if (balance_ == 0.0) length_ = t - accepted_;
-  if (length_ > 0.0) balance_ = std::max(0.0, balance_ - (t - accepted_) / length_);
-  accepted_ = t;
-  level(t);
-  if (!on_manifold_ && t - t_start_ > gone * epsilon_) return on_manifold_ = true, Accepted::changed;
-  if (may_switch && here < alarm_ && !(w.lpNorm<Eigen::Infinity>() > tolerance_)) {
-    alarm_ = std::max(fallen * here, poor);
-    Partition better;
-    if (exact(t, y) && best_partition(core, better) && better.q != core.q) {
-      const Partition present{core.q, core.z};
-      if (move_to(better, t, y)) {
-        if (margin() > clearly * here) {
+// Off the manifold eq. 8 depends on the choice of q, because only z_dot closes the loops. The partition is kept
+// there.
+Accepted LevelSet::accept_step(double t, Out y, double present_margin) {
+  accepted_q_tree_ = last_q_tree_;
+  elimination.accept_step(core);
+  if (rejection_balance_ == 0.0) usual_step_ = t - accepted_t_;
+  if (usual_step_ > 0.0) rejection_balance_ = std::max(0.0, rejection_balance_ - (t - accepted_t_) / usual_step_);
+  accepted_t_ = t;
+  update_w(t);
+  if (!on_manifold_ && t - t_start_ > w_lifetime * epsilon_) return on_manifold_ = true, Accepted::changed;
+  if (may_change_partition && present_margin < search_margin_ && !(w.lpNorm<Eigen::Infinity>() > tolerance_)) {
+    search_margin_ = std::max(search_again_ratio * present_margin, min_margin);
+    Partition candidate;
+    if (sync_core(t, y) && find_best_partition(core, candidate) && candidate.q != core.q) {
+      const Partition previous{core.q, core.z};
+      if (change_partition(candidate, t, y)) {
+        if (coordinate_margin() > min_margin_gain * present_margin) {
           ++counts.switches;
-          refusals_ = 0, balance_ = 0.0;
+          disagreements_ = 0, rejection_balance_ = 0.0;
           return Accepted::restarted;
         }
-        move_to(present, t, y);
-        alarm_ = std::max(fallen * here, poor);
+        change_partition(previous, t, y);
+        search_margin_ = std::max(search_again_ratio * present_margin, min_margin);
       }
     }
   }
-  if (!(here > chart_margin)) return Accepted::refused;
-  if (!chart_.outgrown(y.head(core.d))) return Accepted::kept;
-  if (!exact(t, y)) return Accepted::refused;
-  begin(core.q_tree);
+  if (!(present_margin > chart_margin)) return Accepted::rejected;
+  if (!chart_.needs_new_reference(y.head(core.d))) return Accepted::unchanged;
+  if (!sync_core(t, y)) return Accepted::rejected;
+  reset_coordinates(core.q_tree);
   chart_numbers(y);
   return Accepted::restarted;
 }
 
-// Write the core's state in other coordinates; false where phi_z is singular in them.
-bool LevelSet::move_to(const Partition& partition, double t, Out y) {
+// Express the core's state in another partition. False if its phi_z is singular.
+bool LevelSet::change_partition(const Partition& partition, double t, Out y) {
   const Vector q_tree = core.q_tree, v = velocity;
-  core.split(partition.q, partition.z);
+  core.set_partition(partition.q, partition.z);
   z_.setZero(core.z.size());
-  core.set(q_tree);
-  core.reduce();
-  begin(q_tree);
+  core.set_configuration(q_tree);
+  core.compute_rho();
+  reset_coordinates(q_tree);
   chart_numbers(y);
   for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
-  return !core.phi_z.singular() && exact(t, y);
+  return !core.phi_z.singular() && sync_core(t, y);
 }
 
-bool LevelSet::own_partition(double t, Out y, bool& changed) {
-  changed = core.q != own_.q;
+bool LevelSet::restore_partition(double t, Out y, bool& changed) {
+  changed = core.q != fixed_partition_.q;
   if (!changed) return true;
-  return exact(t, y) && move_to(own_, t, y) && margin() > chart_margin;
+  return sync_core(t, y) && change_partition(fixed_partition_, t, y) && coordinate_margin() > chart_margin;
 }
 
 }  // namespace ckc

@@ -8,19 +8,22 @@ namespace ckc {
 
 using Clock = std::chrono::steady_clock;
 
-// At least, in a run that crosses losses of rank: with less they come out up to 1e-2 off after ten seconds.
-constexpr double fine_rtol = 1e-7;
-constexpr double shortest_known = 1e-9;  // of what is left: a step whose end, or inside, cannot be known is made again
-constexpr double energy_change = 100.0;  // of a conservative motion in a step, in tolerances: a wrong step, not an error
-constexpr double least_rise = 1e-10;  // rad, or of the mechanism's size, of a bounce: less is how closely loops close
+// Upper bound of rtol in runs that cross singular positions. With larger values errors reach 1e-2 after ten seconds.
+constexpr double crossing_rtol = 1e-7;
+// of the remaining time: smallest step that is retried if its end or interior cannot be evaluated
+constexpr double min_retry_fraction = 1e-9;
+// relative to the tolerances: a larger change of a conservative motion's energy means a wrong step
+constexpr double max_energy_change = 100.0;
+// rad, or relative to the mechanism's size: smaller bounces are within the closure tolerance
+constexpr double min_bounce_rise = 1e-10;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
-  Dae* dae = dynamic_cast<Dae*>(&system);
-  return dae && dae->crosses ? std::make_unique<Collocation>(*dae, work) : nullptr;
+  return system.crosses_singularities ? std::make_unique<Collocation>(system, work) : nullptr;
 }
 
-Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, Options options, std::vector<Event> list)
+StepLoop::StepLoop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, Options options,
+                   std::vector<Event> list)
     : control(std::move(control_)),
       system(std::move(system_)),
       recorder(*system),
@@ -31,320 +34,330 @@ Loop::Loop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, O
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
       energy_(system->core),
-      crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.closed),
-      joint_changes_(*system, std::max(options_.atol, least_rise), tolerance_) {
+      crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.manifold_tolerance),
+      joint_transitions_(*system, std::max(options_.atol, min_bounce_rise), tolerance_) {
   for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
 
-void Loop::start(double t, In q_tree, In v_tree, In w) {
+void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   tolerance_.rtol = options_.rtol, tolerance_.atol = options_.atol;
-  begin_ = {t, q_tree, v_tree, w};
-  work = {}, work.most_rhs = options_.max_rhs;
-  system->counts = {}, system->trouble = Trouble::none;
-  control->problem = {};
-  control->begin();
-  begin_joints();
+  start_ = {t, q_tree, v_tree, w};
+  work = {}, work.max_rhs = options_.max_rhs;
+  system->counts = {}, system->failure = RhsFailure::none;
+  control->failure = {};
+  control->start();
+  reset_joints();
   system->start(t, q_tree, v_tree, w, now.y);
   now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
-  steps = {}, crossings.clear(), kept_ = 0, check_at_ = 0, length_ = 0.0, paced_ = 0, paced_at_ = t;
-  method_ = nullptr, radau_.reset(), segment_ = t;
-  begun_ = f_known_ = jumped_ = false;
-  beyond_.reset(), unchanged_ = 0;
-  crossing_.begin();
-  events.begin();
+  steps = {}, crossings.clear(), accepted_steps_ = 0, next_stiffness_check_ = 0, last_step_size_ = 0.0, pace_rhs_ = 0,
+  pace_time_ = t;
+  method_ = nullptr, radau_.reset(), segment_end_ = t;
+  state_is_accepted_ = rate_is_known_ = cannot_repeat_ = false;
+  waiting_step_.reset(), advances_unchanged_ = 0;
+  crossing_.reset();
+  events.reset();
 }
 
-void Loop::jump() {
-  back();
-  unchanged_ = 0;
-  f_known_ = false, jumped_ = true;
-  joints_known_ = !system->core.joints.any();
-  if (method_) method_->forget();
+void StepLoop::state_changed() {
+  return_to_present();
+  advances_unchanged_ = 0;
+  rate_is_known_ = false, cannot_repeat_ = true;
+  joint_modes_known_ = !system->core.joints.has_events();
+  if (method_) method_->reset_history();
 }
 
-void Loop::hold(In u, bool of_motors) {
-  if (control->hold(u, of_motors)) jump();
+void StepLoop::set_control(In u, bool of_motors) {
+  if (control->set_constant(u, of_motors)) state_changed();
 }
 
-Stop Loop::advance(double until, bool final, double pause, double budget) {
+Stop StepLoop::advance(double until, bool final, double pause, double budget) {
   const auto started = Clock::now();
-  const auto spent = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
-  system->may_switch = !control->needs_own_partition();
+  const auto elapsed = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
+  system->may_change_partition = !control->needs_fixed_partition();
   const double from = t();
-  until_ = until, ++unchanged_;
-  if (beyond_) {
-    if (until < now.t_new) return within(until);
-    const Made step = *beyond_;
-    beyond_.reset();
-    if (const auto stop = finish(step, now.t_new, false)) return *stop;
+  target_ = until, ++advances_unchanged_;
+  if (waiting_step_) {
+    if (until < now.t_new) return report_present(until);
+    const CompletedStep step = *waiting_step_;
+    waiting_step_.reset();
+    if (const auto stop = finish_step(step, now.t_new, false)) return *stop;
   }
-  if (control->needs_own_partition()) {
+  if (control->needs_fixed_partition()) {
     bool changed = false;
-    if (!system->own_partition(now.t, now.y, changed)) return {Stop::chart, now.t, system->margin()};
-    if (changed) begun_ = false, jump();
+    if (!system->restore_partition(now.t, now.y, changed))
+      return {Stop::coordinates_singular, now.t, system->coordinate_margin()};
+    if (changed) state_is_accepted_ = false, state_changed();
   }
-  reaches_ = !final && !control->law && !events.any();
-  double ahead = reaches_ ? static_cast<double>(unchanged_ - 1) * (until - from) : 0.0;  // as far as nothing has changed for
+  may_step_beyond_ = !final && !control->law && events.is_empty();
+  // as far as nothing has changed recently
+  double ahead = may_step_beyond_ ? static_cast<double>(advances_unchanged_ - 1) * (until - from) : 0.0;
   for (;;) {
-    const double near = control->sampling ? control->sampling->near(now.t) : 0.0;
-    if (control->sampling && control->sampling->instant() <= now.t + near)
-      if (const auto stop = sample()) return *stop;
-    last_instant_ = control->sampling ? std::min(until, control->sampling->instant()) - near : until;
-    while (recorder.due(now.t + near)) {
-      if (!recorder.add(*system, recorder.instant(), now.y)) return unknown();
-      recorder.passed();
+    const double time_tolerance = control->sampling ? control->sampling->time_tolerance(now.t) : 0.0;
+    if (control->sampling && control->sampling->next_instant() <= now.t + time_tolerance)
+      if (const auto stop = sample_control()) return *stop;
+    record_until_ = control->sampling ? std::min(until, control->sampling->next_instant()) - time_tolerance : until;
+    while (recorder.is_due(now.t + time_tolerance)) {
+      if (!recorder.add(*system, recorder.next_instant(), now.y)) return output_failure();
+      recorder.advance_instant();
     }
     if (!(now.t < until)) return {Stop::end, now.t};
     double bound = until;
-    if (control->sampling && control->sampling->instant() < until - near) bound = control->sampling->instant();
-    if (bound + ahead != segment_) choose_again(bound + ahead), segment_ = bound + ahead;  // not where a pause has ended
-    if (const auto stop = begin(bound + ahead)) return *stop;
+    if (control->sampling && control->sampling->next_instant() < until - time_tolerance)
+      bound = control->sampling->next_instant();
+    // not after a mere pause
+    if (bound + ahead != segment_end_) choose_explicit_method(bound + ahead), segment_end_ = bound + ahead;
+    if (const auto stop = prepare_step(bound + ahead)) return *stop;
     while (now.t < bound) {
-      const double before = now.t;
-      if (const auto stop = one_step(bound + ahead, final && bound == until)) {
-        if (ahead == 0.0 || now.t != before || stop->why == Stop::rhs_budget) return *stop;
-        ahead = 0.0, now.h = std::min(now.h, bound - now.t);  // what is in the way may lie beyond
+      const double t_before = now.t;
+      if (const auto stop = make_step(bound + ahead, final && bound == until)) {
+        if (ahead == 0.0 || now.t != t_before || stop->reason == Stop::rhs_budget) return *stop;
+        ahead = 0.0, now.h = std::min(now.h, bound - now.t);  // the obstacle may lie beyond `bound`
         continue;
       }
-      if (beyond_) return within(until);
-      if (const auto stop = keep_pace(until)) return *stop;
-      const double seconds = spent();
+      if (waiting_step_) return report_present(until);
+      if (const auto stop = check_pace(until)) return *stop;
+      const double seconds = elapsed();
       if (seconds > budget) return {Stop::wall_budget, now.t};
       if (seconds > pause || work.rhs >= pause_at) return {Stop::pause, now.t};
     }
   }
 }
 
-// Where no budget is given, what would take hours is told in seconds: a motion that runs away turns ever faster.
-std::optional<Stop> Loop::keep_pace(double until) {
-  constexpr long many = 1'000'000;
-  constexpr double longest = 1e9;
-  const long done = work.rhs - paced_;
-  if (options_.max_rhs < unlimited || done < many) return std::nullopt;
-  const double rest = static_cast<double>(done) * (until - now.t) / (now.t - paced_at_);
-  if (!(rest <= longest)) return Stop{Stop::pace, now.t, rest};
-  paced_ = work.rhs, paced_at_ = now.t;
+// Without a budget, stop runs that would take hours, such as a motion that turns ever faster.
+std::optional<Stop> StepLoop::check_pace(double until) {
+  constexpr long min_rhs = 1'000'000;
+  constexpr double max_remaining_rhs = 1e9;
+  const long rhs_done = work.rhs - pace_rhs_;
+  if (options_.max_rhs < unlimited || rhs_done < min_rhs) return std::nullopt;
+  const double remaining_rhs = static_cast<double>(rhs_done) * (until - now.t) / (now.t - pace_time_);
+  if (!(remaining_rhs <= max_remaining_rhs)) return Stop{Stop::pace, now.t, remaining_rhs};
+  pace_rhs_ = work.rhs, pace_time_ = now.t;
   return std::nullopt;
 }
 
-Stop Loop::within(double until) {
-  if (!beyond_->motion->between(until, y_out_)) return unknown();
+Stop StepLoop::report_present(double until) {
+  if (!waiting_step_->motion->interpolate(until, y_out_)) return output_failure();
   t_present_ = until, y_present_ = y_out_;
   return {Stop::end, until};
 }
 
-void Loop::back() {
-  if (!beyond_) return;
+void StepLoop::return_to_present() {
+  if (!waiting_step_) return;
   now.t_old = now.t, now.y_old = now.y;
   now.t = t_present_, now.y = y_present_;
   now.h = std::min(now.h, now.t_new - now.t_old);
-  beyond_.reset(), begun_ = false;
+  waiting_step_.reset(), state_is_accepted_ = false;
 }
 
-// What is sampled sees the state, and what is due acts from here on.
-std::optional<Stop> Loop::sample() {
-  if (!system->exact(now.t, now.y)) return trouble();
+// Sample the state, then apply the outputs whose delay has elapsed.
+std::optional<Stop> StepLoop::sample_control() {
+  if (!system->sync_core(now.t, now.y)) return step_failure();
   system->core.set_velocity(system->v_tree);
   bool changed;
-  if (!control->sample(system->measured(now.t), changed) || !system->sampled(now.y, changed)) return trouble();
-  if (changed) jump();
+  if (!control->sample(system->measured(now.t), changed) || !system->control_sampled(now.y, changed))
+    return step_failure();
+  if (changed) state_changed();
   return {};
 }
 
-// Everything that has to be known before a step.
-std::optional<Stop> Loop::begin(double bound) {
-  if (!joints_known_)
-    if (const auto stop = change_joints()) return stop;
-  const bool anew = !begun_;
-  if (anew) {
-    if (!system->at_start(now.t, now.y)) return trouble();
-    end_ = monitor_.at(*system);
-    energy_.from(*system);
-    const Accepted accepted = system->accept(now.t, now.y, system->margin());
-    if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, system->margin()};
-    if (accepted != Accepted::kept) f_known_ = false;
-    begun_ = true;
+// Evaluate the derivative, events and rank monitor at the start of a step.
+std::optional<Stop> StepLoop::prepare_step(double bound) {
+  if (!joint_modes_known_)
+    if (const auto stop = update_joint_modes()) return stop;
+  const bool is_new = !state_is_accepted_;
+  if (is_new) {
+    if (!system->sync_core_at_start(now.t, now.y)) return step_failure();
+    end_rank_ = monitor_.evaluate(*system);
+    energy_.start_step(*system);
+    const Accepted accepted = system->accept_step(now.t, now.y, system->coordinate_margin());
+    if (accepted == Accepted::rejected) return Stop{Stop::coordinates_singular, now.t, system->coordinate_margin()};
+    if (accepted != Accepted::unchanged) rate_is_known_ = false;
+    state_is_accepted_ = true;
   }
-  if (!f_known_) {
-    f_known_ = (method_ ? *method_ : dop853_).evaluate_start();
-    if (!f_known_) return trouble();
-    events.begun();
-    if (!method_) choose(bound);
+  if (!rate_is_known_) {
+    rate_is_known_ = (method_ ? *method_ : dop853_).evaluate_start();
+    if (!rate_is_known_) return step_failure();
+    events.start_step();
+    if (!method_) choose_method(bound);
   }
   return {};
 }
 
-std::optional<Stop> Loop::one_step(double bound, bool last) {
-  if (const auto stop = begin(bound)) return stop;
+std::optional<Stop> StepLoop::make_step(double bound, bool last) {
+  if (const auto stop = prepare_step(bound)) return stop;
   if (system->core.rank) {
-    const double left = crossing_.left(end_, length_, reaches_ ? infinity : bound);
-    if (std::isfinite(left)) {
-      const double met = crossing_.over(left, length_);
-      if (work.spent || control->problem.raised) return trouble();
-      if (std::isfinite(met)) {
-        if (tolerance_.rtol > fine_rtol) {
-          tolerance_.rtol = fine_rtol, tolerance_.atol = std::min(tolerance_.atol, fine_rtol / 100);
-          if (!jumped_ && now.t > begin_.t) {
-            if (const auto stop = redo()) return stop;
-            crossing_.expect(met);
+    const double remaining =
+        crossing_.time_to_crossing(end_rank_, last_step_size_, may_step_beyond_ ? infinity : bound);
+    if (std::isfinite(remaining)) {
+      const double crossed_at = crossing_.step_over(remaining, last_step_size_);
+      if (work.budget_exhausted || control->failure.raised) return step_failure();
+      if (std::isfinite(crossed_at)) {
+        if (tolerance_.rtol > crossing_rtol) {
+          tolerance_.rtol = crossing_rtol, tolerance_.atol = std::min(tolerance_.atol, crossing_rtol / 100);
+          if (!cannot_repeat_ && now.t > start_.t) {
+            if (const auto stop = repeat_with_finer_tolerance()) return stop;
+            crossing_.expect_at(crossed_at);
             return {};
           }
         }
-        return across(met, left, bound, last);
+        return make_crossing_step(crossed_at, remaining, bound, last);
       }
     }
   }
-  return ordinary(bound, last);
+  return make_ordinary_step(bound, last);
 }
 
-std::optional<Stop> Loop::ordinary(double bound, bool last) {
-  if (!method_->step(bound)) return trouble();
-  system->trouble = Trouble::none;
-  if (!control->problem.says.empty() || control->problem.u.size()) control->problem = {};
+std::optional<Stop> StepLoop::make_ordinary_step(double bound, bool last) {
+  if (!method_->make_step(bound)) return step_failure();
+  system->failure = RhsFailure::none;
+  if (!control->failure.message.empty() || control->failure.u.size()) control->failure = {};
   const double h = now.t_new - now.t;
   if (h < options_.min_step && now.t_new < bound) return Stop{Stop::min_step, now.t};
-  const auto shorter = [&](double part) { return method_->retry(part * h), std::nullopt; };
-  const bool can_be_shorter = h > shortest_known * (bound - now.t);
-  if (!system->at_last(now.t_new, now.y_new)) return can_be_shorter ? shorter(0.5) : std::optional(trouble());
-  if (energy_.at(*system, tolerance_.rtol, tolerance_.atol) > energy_change) {
-    if (can_be_shorter) return shorter(0.5);
+  const auto retry_with = [&](double part) { return method_->reject_step(part * h), std::nullopt; };
+  const bool can_retry = h > min_retry_fraction * (bound - now.t);
+  if (!system->sync_core_at_last_rhs(now.t_new, now.y_new))
+    return can_retry ? retry_with(0.5) : std::optional(step_failure());
+  if (energy_.relative_change(*system, tolerance_.rtol, tolerance_.atol) > max_energy_change) {
+    if (can_retry) return retry_with(0.5);
     return Stop{Stop::energy, now.t, energy_.change};
   }
-  events.arrived();
-  const RankMonitor::Rank after = monitor_.at(*system);
-  const double margin = system->margin();
+  events.end_step();
+  const RankMonitor::Rank after = monitor_.evaluate(*system);
+  const double margin = system->coordinate_margin();
   if (system->core.rank) {
-    const Crossing::Verdict verdict = crossing_.judge(end_, after);
-    if (control->problem.raised || work.spent) return trouble();
-    if (verdict.lost) {
-      method_->between(verdict.t, y_out_);
-      system->exact(verdict.t, y_out_);
+    const Crossing::Verdict verdict = crossing_.judge_step(end_rank_, after);
+    if (control->failure.raised || work.budget_exhausted) return step_failure();
+    if (verdict.rank_lost) {
+      method_->interpolate(verdict.t, y_out_);
+      system->sync_core(verdict.t, y_out_);
       return Stop{Stop::rank, verdict.t, verdict.value};
     }
-    if (verdict.part < 1.0) return shorter(verdict.part);
+    if (verdict.fraction < 1.0) return retry_with(verdict.fraction);
   }
-  return made({method_, std::nan(""), after, margin}, bound, last);
+  return submit_step({method_, std::nan(""), after, margin}, bound, last);
 }
 
-std::optional<Stop> Loop::made(const Made& step, double bound, bool last) {
-  if (!(now.t_new > until_)) return finish(step, bound, last);
-  beyond_ = step;
+std::optional<Stop> StepLoop::submit_step(const CompletedStep& step, double bound, bool last) {
+  if (!(now.t_new > target_)) return finish_step(step, bound, last);
+  waiting_step_ = step;
   return {};
 }
 
-std::optional<Stop> Loop::finish(const Made& step, double bound, bool last) {
+std::optional<Stop> StepLoop::finish_step(const CompletedStep& step, double bound, bool last) {
   const double h = now.t_new - now.t;
-  const bool ordinary = std::isnan(step.met);
-  if (const auto stop = keep(step, last)) {
-    if (!ordinary || stop->why != Stop::output || !(h > shortest_known * (bound - now.t))) return stop;
-    return method_->retry(0.5 * h), std::nullopt;
+  const bool is_ordinary = std::isnan(step.crossed_at);
+  if (const auto stop = accept_step(step, last)) {
+    if (!is_ordinary || stop->reason != Stop::output || !(h > min_retry_fraction * (bound - now.t))) return stop;
+    return method_->reject_step(0.5 * h), std::nullopt;
   }
-  ++steps[number()];
-  if (ordinary) return length_ = h, begun_ ? check_stiffness(bound) : std::nullopt;
-  method_->forget();
-  crossings.push_back(step.met);
+  ++steps[method_index()];
+  if (is_ordinary) return last_step_size_ = h, state_is_accepted_ ? check_stiffness(bound) : std::nullopt;
+  method_->reset_history();
+  crossings.push_back(step.crossed_at);
   return {};
 }
 
-// Over a position where J loses rank, by the collocation step just found.
-std::optional<Stop> Loop::across(double met, double left, double bound, bool last) {
+// Cross a singular position with the collocation step that was just found.
+std::optional<Stop> StepLoop::make_crossing_step(double crossed_at, double remaining, double bound, bool last) {
   Collocation& motion = *crossing_.collocation;
-  now.t_new = reaches_ ? motion.t : std::min(motion.t, bound), now.h_next = length_ > 0.0 ? length_ : left;
-  motion.at(now.t_new, now.y_new);
-  if (!system->exact(now.t_new, now.y_new)) return trouble();
-  energy_.from(*system);
-  const RankMonitor::Rank after = monitor_.at(*system);
-  events.jump();
-  const bool ends = last && now.t_new == bound;  // right there, perhaps: nothing has to go on from it
-  if (!ends && !RankMonitor::kept(after)) return Stop{Stop::rank, now.t_new, after.value};
-  if (!ends && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return trouble();
-  if (!ends) events.arrived();
-  return made({&motion, met, after, system->margin()}, bound, last);
+  now.t_new = may_step_beyond_ ? motion.t : std::min(motion.t, bound),
+  now.h_next = last_step_size_ > 0.0 ? last_step_size_ : remaining;
+  motion.evaluate(now.t_new, now.y_new);
+  if (!system->sync_core(now.t_new, now.y_new)) return step_failure();
+  energy_.start_step(*system);
+  const RankMonitor::Rank after = monitor_.evaluate(*system);
+  events.restart();
+  const bool is_end = last && now.t_new == bound;  // a run may end at a singular position
+  if (!is_end && !RankMonitor::has_rank(after)) return Stop{Stop::rank, now.t_new, after.value};
+  if (!is_end && !method_->evaluate(now.t_new, now.y_new, now.f_new)) return step_failure();
+  if (!is_end) events.end_step();
+  return submit_step({&motion, crossed_at, after, system->coordinate_margin()}, bound, last);
 }
 
-// Look at what happened in the step just made, and make its end the present state.
-std::optional<Stop> Loop::keep(const Made& step, bool last) {
-  if (!silent_ || system->core.joints.any()) {
+// Find events and record outputs in a completed step, then make its end the present state.
+std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) {
+  if (!is_repeating_ || system->core.joints.has_events()) {
     Interpolant& motion = *step.motion;
-    double halt;
-    if (const auto stop = look(motion, last, halt)) return stop;
-    if (!silent_)
-      if (const auto stop = outputs(motion, std::min(now.t_new, halt))) return stop;
-    if (std::isfinite(halt)) {
-      if (halt < now.t_new && !motion.between(halt, y_out_)) return unknown();
+    double stop_time;
+    if (const auto stop = find_events(motion, last, stop_time)) return stop;
+    if (!is_repeating_)
+      if (const auto stop = record_outputs(motion, std::min(now.t_new, stop_time))) return stop;
+    if (std::isfinite(stop_time)) {
+      if (stop_time < now.t_new && !motion.interpolate(stop_time, y_out_)) return output_failure();
       now.t_old = now.t, now.y_old = now.y;
-      now.y = halt < now.t_new ? y_out_ : now.y_new, now.t = halt;
-      begun_ = false;
-      jump(), events.jump();
-      if (!events.halted()) return {};  // joints go on in another way
-      if (system->core.joints.any() && now.t == now.t_old) recorder.drop_row_at(now.t);  // recorded before an impact
-      if (!record_now()) return trouble();
+      now.y = stop_time < now.t_new ? y_out_ : now.y_new, now.t = stop_time;
+      state_is_accepted_ = false;
+      state_changed(), events.restart();
+      if (!events.stopped()) return {};  // only joint modes change
+      // was recorded before an impact
+      if (system->core.joints.has_events() && now.t == now.t_old) recorder.drop_row_at(now.t);
+      if (!record_now()) return step_failure();
       return Stop{Stop::event, now.t};
     }
   }
-  const Accepted accepted = system->accept(now.t_new, now.y_new, step.margin);
-  method_->commit();
-  crossing_.kept(step.after);
-  end_ = step.after, energy_.kept();
-  f_known_ = accepted == Accepted::kept;
-  if (accepted == Accepted::refused) return Stop{Stop::chart, now.t, step.margin};
-  if (accepted == Accepted::restarted) method_->forget();
-  return system->core.joints.any() ? keep_joints() : std::nullopt;
+  const Accepted accepted = system->accept_step(now.t_new, now.y_new, step.margin);
+  method_->accept_step();
+  crossing_.accept_step(step.after);
+  end_rank_ = step.after, energy_.accept_step();
+  rate_is_known_ = accepted == Accepted::unchanged;
+  if (accepted == Accepted::rejected) return Stop{Stop::coordinates_singular, now.t, step.margin};
+  if (accepted == Accepted::restarted) method_->reset_history();
+  return system->core.joints.has_events() ? check_joints() : std::nullopt;
 }
 
-std::optional<Stop> Loop::look(Interpolant& motion, bool last, double& halt) {
-  if (events.check(motion, last, silent_, halt)) return {};
+std::optional<Stop> StepLoop::find_events(Interpolant& motion, bool last, double& stop_time) {
+  if (events.find_events(motion, last, is_repeating_, stop_time)) return {};
   return event_failure();
 }
 
-// Why an event's function has no value.
-Stop Loop::event_failure() {
-  if (events.failed >= 0) return Stop{Stop::function, now.t, events.failed_value, events.failed};
-  return unknown();
+// Reason why an event's function has no value.
+Stop StepLoop::event_failure() {
+  if (events.failed >= 0) return Stop{Stop::event_function, now.t, events.failed_value, events.failed};
+  return output_failure();
 }
 
-std::optional<Stop> Loop::outputs(Interpolant& motion, double until) {
-  for (until = std::min(until, last_instant_); recorder.due(until); recorder.passed()) {
-    const double t = recorder.instant();
+std::optional<Stop> StepLoop::record_outputs(Interpolant& motion, double until) {
+  for (until = std::min(until, record_until_); recorder.is_due(until); recorder.advance_instant()) {
+    const double t = recorder.next_instant();
     if (t == now.t_new)
       y_out_ = now.y_new;
-    else if (!motion.between(t, y_out_))
-      return unknown();
-    if (!recorder.add(*system, t, y_out_)) return unknown();
+    else if (!motion.interpolate(t, y_out_))
+      return output_failure();
+    if (!recorder.add(*system, t, y_out_)) return output_failure();
   }
   return {};
 }
 
-// Why a state within a step cannot be known.
-Stop Loop::unknown() {
-  const Stop stop = trouble();
-  return stop.why == Stop::step ? Stop{Stop::output, now.t} : stop;
+// Reason why a state within a step cannot be evaluated.
+Stop StepLoop::output_failure() {
+  const Stop stop = step_failure();
+  return stop.reason == Stop::step ? Stop{Stop::output, now.t} : stop;
 }
 
-bool Loop::record_now() { return recorder.add(*system, t(), y()); }
+bool StepLoop::record_now() { return recorder.add(*system, t(), y()); }
 
-// Come to the present time once more from the start, with the finer tolerance.
-std::optional<Stop> Loop::redo() {
+// Repeat the run up to the present time with a smaller tolerance.
+std::optional<Stop> StepLoop::repeat_with_finer_tolerance() {
   const double until = now.t;
-  begin_joints();
-  system->start(begin_.t, begin_.q_tree, begin_.v_tree, begin_.w, now.y);
-  now.t = now.t_old = begin_.t, now.h = (until - now.t) / 10;
-  begun_ = f_known_ = false, length_ = 0.0;
-  method_->forget();
-  crossing_.begin();
-  silent_ = true, reaches_ = false;
+  reset_joints();
+  system->start(start_.t, start_.q_tree, start_.v_tree, start_.w, now.y);
+  now.t = now.t_old = start_.t, now.h = (until - now.t) / 10;
+  state_is_accepted_ = rate_is_known_ = false, last_step_size_ = 0.0;
+  method_->reset_history();
+  crossing_.reset();
+  is_repeating_ = true, may_step_beyond_ = false;
   std::optional<Stop> stop;
-  while (now.t < until && !stop) stop = one_step(until, false);
-  silent_ = false;
-  if (!stop) stop = begin(infinity);
+  while (now.t < until && !stop) stop = make_step(until, false);
+  is_repeating_ = false;
+  if (!stop) stop = prepare_step(infinity);
   return stop;
 }
 
-// Why no step can be made.
-Stop Loop::trouble() {
-  if (control->problem.raised) return {Stop::raised, now.t};
-  if (work.spent) return {Stop::rhs_budget, now.t};
-  if (system->trouble == Trouble::control || !control->problem.says.empty() || control->problem.u.size())
+// Reason why no step can be made.
+Stop StepLoop::step_failure() {
+  if (control->failure.raised) return {Stop::exception, now.t};
+  if (work.budget_exhausted) return {Stop::rhs_budget, now.t};
+  if (system->failure == RhsFailure::no_control || !control->failure.message.empty() || control->failure.u.size())
     return {Stop::control, now.t};
   return {Stop::step, now.t};
 }

@@ -1,4 +1,4 @@
-// The step loop: the one place where time advances. It owns its state, and says why it stopped as a value.
+// The step loop, the only place where time advances. It owns its state and returns the reason why it stopped.
 #pragma once
 
 #include <array>
@@ -16,57 +16,58 @@ namespace ckc {
 constexpr long unlimited = 1L << 62;
 
 struct Options {
-  std::string method;  // "auto", or one by name
+  std::string method;  // "auto" or the name of a method
   double rtol, atol, max_step, min_step;
-  long max_rhs;        // `unlimited` where none is given
-  double closed;       // rad or m: how far the loops may be open along a collocation step
+  long max_rhs;               // `unlimited` if there is no budget
+  double manifold_tolerance;  // rad or m: largest |phi| along a collocation step
 };
 
 struct Stop {
-  enum Why {
-    end,          // the time asked for is reached
-    event,        // one that stops
-    pause,        // the interpreter is to be let in
+  enum Reason {
+    end,    // the requested time is reached
+    event,  // a stopping event occurred
+    pause,  // the interpreter should run
     rhs_budget,
     wall_budget,
-    pace,         // the rest would take more right-hand sides than anyone waits for
+    pace,  // the rest would take too many right-hand sides
     min_step,
-    step,         // no step can be made: see `trouble`
-    rank,         // J loses rank and that cannot be passed
-    chart,        // q has stopped to determine z
-    energy,       // a conservative motion's energy changes, however short the step
-    control,      // a controller has no u
-    function,     // an event's function has no finite value
-    output,       // the state has no terms
-    chatter,      // joints change their mode again and again at one instant
-    contact,      // no contact forces or impulses are found there
-    beyond_stop,  // a joint has passed its stop: `which`
-    raised,       // a caller's function did
-  } why;
-  double t = 0.0, value = 0.0;  // when; least singular value, right-hand sides, or what a function gave
-  int which = -1;               // whose function, or which coordinate
+    step,                  // no step can be made, see System::failure
+    rank,                  // J loses rank, and that cannot be crossed
+    coordinates_singular,  // phi_z is singular: q does not determine z
+    energy,                // the energy of a conservative motion changes, however short the step
+    control,               // the controller has no u
+    event_function,        // an event's function has no finite value
+    output,                // the state cannot be recorded
+    chatter,               // joint modes change again and again at one instant
+    contact_unsolved,      // no contact forces or impulses exist
+    beyond_stop,           // joint `which` has passed its stop
+    exception,             // a callback raised an exception
+  } reason;
+  double t = 0.0, value = 0.0;  // time; smallest singular value, right-hand sides, or value of a function
+  int which = -1;               // event or coordinate
 };
 
-class Loop {
+class StepLoop {
  public:
-  Loop(std::unique_ptr<Control> control, std::unique_ptr<System> system, Options options, std::vector<Event> events);
+  StepLoop(std::unique_ptr<Control> control, std::unique_ptr<System> system, Options options,
+           std::vector<Event> events);
 
-  // Begin at t from a configuration closed on phi = w, moving with v'; what was before has no influence.
+  // Start at t from a configuration with phi = w and velocity v'. Earlier runs have no influence.
   void start(double t, In q_tree, In v_tree, In w);
-  void record(Vector instants, double* rows, Eigen::Index most) { recorder.begin(std::move(instants), rows, most); }
-  // Let a u act from now on, constant; or torques of the motors.
-  void hold(In u, bool of_motors);
-  // Go on to a time. `final`: the motion ends there; seconds to the next pause, and to the end of the budget.
-  // Where it does not end, and nothing has changed for some advances, a step may reach beyond; the present state is
-  // then within it, and the step is made again from there should something change.
+  void record(Vector instants, double* rows, Eigen::Index most) { recorder.start(std::move(instants), rows, most); }
+  // Apply a constant u, or constant motor torques, from now on.
+  void set_control(In u, bool of_motors);
+  // Advance to a time. `final`: the motion ends there. `pause`, `budget`: seconds until the next pause and until the
+  // end of the budget. If the motion does not end and nothing has changed for several calls, the last step may reach
+  // beyond `until`. The present state is then inside that step, and the step is discarded if something changes.
   Stop advance(double until, bool final, double pause, double budget);
-  // The present state.
-  double t() const { return beyond_ ? t_present_ : now.t; }
-  const Vector& y() const { return beyond_ ? y_present_ : now.y; }
-  // Record it, unless that instant is recorded already.
+  // Present time and state.
+  double t() const { return waiting_step_ ? t_present_ : now.t; }
+  const Vector& y() const { return waiting_step_ ? y_present_ : now.y; }
+  // Record the present state unless that instant is already recorded. False if it cannot be evaluated.
   bool record_now();
-  // The core there, closed, with the system's velocity and w; false where that does not exist.
-  bool settle_core() { return system->exact(t(), y()); }
+  // Set the core to the present state, projected. False if that fails.
+  bool sync_core() { return system->sync_core(t(), y()); }
 
   const std::unique_ptr<Control> control;
   const std::unique_ptr<System> system;
@@ -74,53 +75,54 @@ class Loop {
   Work work;
   Recorder recorder;
   Events events;
-  std::array<long, 3> steps{};  // by method: DOP853, RK45, Radau
-  std::vector<double> crossings;  // when J lost rank
+  std::array<long, 3> steps{};    // by method: DOP853, RK45, Radau
+  std::vector<double> crossings;  // times at which J lost rank
   const Method* method() const { return method_; }
   double& newton_tolerance() { return tolerance_.newton; }
-  // Right-hand sides after which `advance` pauses, whatever the time.
+  // `advance` pauses after this many right-hand sides.
   long pause_at = std::numeric_limits<long>::max();
 
  private:
-  // A step that was made: how it moves, when J lost rank on it (NaN for an ordinary one), and what is known at its end.
-  struct Made {
+  // A completed step: its interpolant, the time at which J lost rank (NaN for an ordinary step), and rank and margin
+  // at its end.
+  struct CompletedStep {
     Interpolant* motion;
-    double met;
+    double crossed_at;
     RankMonitor::Rank after;
     double margin;
   };
-  std::optional<Stop> begin(double bound);
-  std::optional<Stop> one_step(double bound, bool last);
-  std::optional<Stop> ordinary(double bound, bool last);
-  std::optional<Stop> across(double met, double left, double bound, bool last);
-  // Keep a step, unless it goes beyond the time asked for: then it waits.
-  std::optional<Stop> made(const Made& step, double bound, bool last);
-  std::optional<Stop> finish(const Made& step, double bound, bool last);
-  std::optional<Stop> keep(const Made& step, bool last);
+  std::optional<Stop> prepare_step(double bound);
+  std::optional<Stop> make_step(double bound, bool last);
+  std::optional<Stop> make_ordinary_step(double bound, bool last);
+  std::optional<Stop> make_crossing_step(double crossed_at, double remaining, double bound, bool last);
+  // Finish a step, or let it wait if it ends beyond the requested time.
+  std::optional<Stop> submit_step(const CompletedStep& step, double bound, bool last);
+  std::optional<Stop> finish_step(const CompletedStep& step, double bound, bool last);
+  std::optional<Stop> accept_step(const CompletedStep& step, bool last);
   std::optional<Stop> check_stiffness(double bound);
-  std::optional<Stop> keep_pace(double until);
-  Stop within(double until);  // the step that goes beyond
-  void back();                // from it to the present state
-  std::optional<Stop> look(Interpolant& motion, bool last, double& halt);
+  std::optional<Stop> check_pace(double until);
+  Stop report_present(double until);  // inside the waiting step
+  void return_to_present();           // discards the waiting step
+  std::optional<Stop> find_events(Interpolant& motion, bool last, double& stop_time);
   Stop event_failure();
-  std::optional<Stop> outputs(Interpolant& motion, double until);
-  std::optional<Stop> redo();
-  int number() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // of the method
-  std::optional<Stop> sample();
-  Stop trouble();
-  Stop unknown();
-  void jump();
-  // Which joints slide, stick and touch from the present state on.
-  std::optional<Stop> change_joints();
-  void begin_joints();
-  // At the end of a step that was kept.
-  std::optional<Stop> keep_joints();
-  void choose(double bound);      // a method, at the start
-  void choose_again(double bound);  // of the explicit ones, for another segment
-  double lasts(double bound) const;  // s: the motion's present piece
-  bool is_stiff(double bound);
-  void take(Method& method);
-  void take_implicit();
+  std::optional<Stop> record_outputs(Interpolant& motion, double until);
+  std::optional<Stop> repeat_with_finer_tolerance();
+  int method_index() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // in `steps`
+  std::optional<Stop> sample_control();
+  Stop step_failure();
+  Stop output_failure();
+  void state_changed();
+  // Decide which joints slide, stick and touch from the present state on.
+  std::optional<Stop> update_joint_modes();
+  void reset_joints();
+  // Check the joints at the end of an accepted step.
+  std::optional<Stop> check_joints();
+  void choose_method(double bound);             // at the start
+  void choose_explicit_method(double bound);    // for a new segment
+  double segment_duration(double bound) const;  // s, expected
+  bool motion_is_stiff(double bound);
+  void use_method(Method& method);
+  void use_implicit_method();
 
   const Options options_;
   Tolerance tolerance_;
@@ -130,33 +132,34 @@ class Loop {
   RankMonitor monitor_;
   EnergyMonitor energy_;
   Crossing crossing_;
-  JointChanges joint_changes_;
-  RankMonitor::Rank end_;     // at the present state
-  double length_ = 0.0;       // of the last step
-  bool begun_ = false;        // whether the present state was accepted, and end_ is known
-  bool f_known_ = false;
-  bool joints_known_ = true;  // how they go on from the present state
-  double joints_at_ = 0.0;    // when that was found last,
-  long joints_often_ = 0;     // and how often within what events are located to
-  bool jumped_ = false;       // something has changed since the start that a second try would not know
-  bool silent_ = false;       // nothing is recorded, no event is looked for
-  long kept_ = 0, check_at_ = 0; // steps since the start; at how many stiffness is checked again, 0 for never
-  long paced_ = 0;            // right-hand sides when the pace was looked at last,
-  double paced_at_ = 0.0;     // and where that was
-  long restarts_ = 0;         // times that joints have changed since the start
-  double last_instant_ = 0.0; // outputs up to there are of the present segment,
-  double segment_ = 0.0;      // which ends there; the start, before the first one
-  struct Begin {
+  JointModeTransitions joint_transitions_;
+  RankMonitor::Rank end_rank_;  // at the present state
+  double last_step_size_ = 0.0;
+  bool state_is_accepted_ = false;  // and end_rank_ is valid
+  bool rate_is_known_ = false;
+  bool joint_modes_known_ = true;    // for the motion from the present state on
+  double joint_modes_time_ = 0.0;    // s, of the last update of joint modes
+  long transitions_at_instant_ = 0;  // transitions within the tolerance of that time
+  bool cannot_repeat_ = false;       // control or state have changed since the start, so the run cannot be repeated
+  bool is_repeating_ = false;        // the run is being repeated: do not record or report events
+  // since the start; number of steps at which stiffness is checked next, 0 for never
+  long accepted_steps_ = 0, next_stiffness_check_ = 0;
+  long pace_rhs_ = 0;          // right-hand sides at the last check of the pace
+  double pace_time_ = 0.0;     // s, of that check
+  long joint_segments_ = 0;    // number of joint transitions since the start
+  double record_until_ = 0.0;  // outputs up to this time belong to the present segment
+  double segment_end_ = 0.0;   // end of the present segment; the start, before the first one
+  struct Start {
     double t = 0.0;
     Vector q_tree, v_tree, w;
-  } begin_;
+  } start_;
   Vector y_out_;
 
-  bool reaches_ = false;         // whether a step may go beyond the time asked for,
-  std::optional<Made> beyond_;   // the one that does,
-  double until_ = 0.0, t_present_ = 0.0;  // that time, and the present one within it
+  bool may_step_beyond_ = false;               // whether a step may end beyond the requested time
+  std::optional<CompletedStep> waiting_step_;  // such a step
+  double target_ = 0.0, t_present_ = 0.0;      // requested time; present time inside that step
   Vector y_present_;
-  long unchanged_ = 0;           // advances since something changed
+  long advances_unchanged_ = 0;  // calls of `advance` since the last change
 };
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// When it is decided anew which joints slide, stick and touch.
+// Transitions of joint modes in the step loop.
 #include <algorithm>
 #include <cmath>
 
@@ -6,55 +6,63 @@
 
 namespace ckc {
 
-constexpr double located = 4e-12, of_step = 1e-9;  // s, and of the last step: how closely an event's time is known
-constexpr long most_changes = 200;  // of joints at one instant
-// After so many changes at one instant, forces count as zero up to ever larger rounding errors, so that joints stay held:
-// up to 1e-6 of the forces.
-constexpr long impatient_changes = 10, patience_steps = 12;
-constexpr double patience_growth = 4.0;
-constexpr double stirs = 1e-9;      // of the fastest coordinate: an idle joint begins to move
-constexpr double passed = 1e-7;       // rad, or of the mechanism's size: a stop was passed unseen
-constexpr double longer = 1.5;      // times the bounce that follows: the step from there
+// s, and relative to the last step: accuracy of an event's time
+constexpr double event_time_tolerance = 4e-12, relative_event_time_tolerance = 1e-9;
+constexpr long max_transitions_at_instant = 200;
+// After this many transitions at one instant, the rounding tolerance of forces grows step by step, up to 1e-6 of the
+// forces, so that joints stay locked.
+constexpr long transitions_before_growth = 10, max_growth_steps = 12;
+constexpr double rounding_growth = 4.0;
+// of the fastest coordinate: above it an immobile joint has started to move
+constexpr double min_relative_immobile_rate = 1e-9;
+// rad, or relative to the mechanism's size: beyond it a stop was passed unnoticed
+constexpr double stop_passed_tolerance = 1e-7;
+constexpr double max_flight_ratio = 1.5;  // of the following bounce's duration: largest first step
 
-void Loop::begin_joints() {
-  system->core.joints.begin();
-  joint_changes_.begin();
-  joints_known_ = !system->core.joints.any(), joints_often_ = restarts_ = 0;
+void StepLoop::reset_joints() {
+  system->core.joints.reset();
+  joint_transitions_.reset();
+  joint_modes_known_ = !system->core.joints.has_events(), transitions_at_instant_ = joint_segments_ = 0;
 }
 
-std::optional<Stop> Loop::change_joints() {
-  const double within = located + of_step * std::max(now.t - now.t_old, 0.0);
-  joints_often_ = std::abs(now.t - joints_at_) <= within ? joints_often_ + 1 : 0;
-  if (!joints_often_ && now.t > begin_.t) ++restarts_;
-  joints_at_ = now.t;
-  if (!silent_ && !events.learn_signs_before_change(now.t, now.y)) return event_failure();
-  if (joints_often_ > most_changes) return Stop{Stop::chatter, now.t};
-  system->core.joints.patience =
-      std::pow(patience_growth, std::clamp<long>(joints_often_ - impatient_changes, 0, patience_steps));
-  if (!joint_changes_.decide(now.t, now.y, events.changing, within)) {
-    const Stop stop = trouble();
-    return stop.why == Stop::step && system->trouble == Trouble::none ? Stop{Stop::contact, now.t} : stop;
+std::optional<Stop> StepLoop::update_joint_modes() {
+  const double time_tolerance = event_time_tolerance + relative_event_time_tolerance * std::max(now.t - now.t_old, 0.0);
+  transitions_at_instant_ = std::abs(now.t - joint_modes_time_) <= time_tolerance ? transitions_at_instant_ + 1 : 0;
+  if (!transitions_at_instant_ && now.t > start_.t) ++joint_segments_;
+  joint_modes_time_ = now.t;
+  if (!is_repeating_ && !events.learn_signs_before_change(now.t, now.y)) return event_failure();
+  if (transitions_at_instant_ > max_transitions_at_instant) return Stop{Stop::chatter, now.t};
+  system->core.joints.rounding_factor = std::pow(
+      rounding_growth, std::clamp<long>(transitions_at_instant_ - transitions_before_growth, 0, max_growth_steps));
+  if (!joint_transitions_.update(now.t, now.y, events.joint_events, time_tolerance)) {
+    const Stop stop = step_failure();
+    return stop.reason == Stop::step && system->failure == RhsFailure::none ? Stop{Stop::contact_unsolved, now.t}
+                                                                            : stop;
   }
-  events.monitor_joints(joint_changes_.coordinates, system->velocity, within);
-  joints_known_ = true, begun_ = f_known_ = false;
-  // A step that is far longer than what happens next would not see that.
-  now.h = std::min(joints_often_ ? now.h / 4 : now.h, longer * joint_changes_.flight);
+  events.monitor_joints(joint_transitions_.coordinates, system->velocity, time_tolerance);
+  joint_modes_known_ = true, state_is_accepted_ = rate_is_known_ = false;
+  // A step much longer than the next bounce would miss it.
+  now.h = std::min(transitions_at_instant_ ? now.h / 4 : now.h,
+                   max_flight_ratio * joint_transitions_.first_bounce_duration);
   return {};
 }
 
-std::optional<Stop> Loop::keep_joints() {
+std::optional<Stop> StepLoop::check_joints() {
   Joints& joints = system->core.joints;
   if (!joints.locked.empty()) {
     bool changed;
-    if (!system->exact(now.t, now.y) || !system->keep_locked(now.y, options_.closed / 10, changed)) return trouble();
-    if (changed) f_known_ = false;
-    if (!system->stays_locked(tolerance_.atol)) return trouble();
+    if (!system->sync_core(now.t, now.y) ||
+        !system->correct_locked_joints(now.y, options_.manifold_tolerance / 10, changed))
+      return step_failure();
+    if (changed) rate_is_known_ = false;
+    if (!system->stays_locked(tolerance_.atol)) return step_failure();
   }
-  const int beyond = joints.beyond_stop(system->core.q_tree, system->core.tree.place, passed);
+  const int beyond =
+      joints.find_joint_beyond_stop(system->core.q_tree, system->core.tree.q_index, stop_passed_tolerance);
   if (beyond >= 0) return Stop{Stop::beyond_stop, now.t, 0.0, beyond};
-  const double moving = stirs * system->velocity.lpNorm<Eigen::Infinity>();
-  for (int k : joints.idle)
-    if (std::abs(system->velocity(k)) > moving) return jump(), std::nullopt;
+  const double rate_tolerance = min_relative_immobile_rate * system->velocity.lpNorm<Eigen::Infinity>();
+  for (int k : joints.immobile)
+    if (std::abs(system->velocity(k)) > rate_tolerance) return state_changed(), std::nullopt;
   return {};
 }
 

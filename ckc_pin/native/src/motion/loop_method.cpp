@@ -1,4 +1,4 @@
-// Which method makes the steps.
+// Choice of the integration method in the step loop.
 #include <algorithm>
 
 #include "motion/loop.hpp"
@@ -6,61 +6,65 @@
 
 namespace ckc {
 
-constexpr long first_check = 50;   // steps after which stiffness is looked at again, then twice as many
-constexpr double few_steps = 2.0;  // of RK45: a segment that takes no more is its
+constexpr long first_stiffness_check = 50;  // steps after which stiffness is checked; checked again after twice as many
+constexpr double max_rk45_steps = 2.0;      // shorter segments use RK45
 
-void Loop::take(Method& method) {
+void StepLoop::use_method(Method& method) {
   if (method_ == &method) return;
   method_ = &method;
-  method_->forget();
+  method_->reset_history();
 }
 
-void Loop::take_implicit() {
+void StepLoop::use_implicit_method() {
   radau_ = std::make_unique<Radau>(*system, now, work, tolerance_);
-  take(*radau_);
+  use_method(*radau_);
 }
 
-// "auto": implicit where damping or a controller makes the motion stiff.
-void Loop::choose(double bound) {
-  const bool may_be_stiff = options_.method == "auto" && (control->feedback() || system->core.springs.any_damping || system->core.joints.smooth());
-  if (options_.method == "Radau" || (may_be_stiff && is_stiff(bound))) {
-    take_implicit();
+// "auto" chooses the implicit method if damping or a controller makes the motion stiff.
+void StepLoop::choose_method(double bound) {
+  const bool may_be_stiff = options_.method == "auto" && (control->is_feedback() || system->core.springs.has_damping ||
+                                                          system->core.joints.has_smooth_friction());
+  if (options_.method == "Radau" || (may_be_stiff && motion_is_stiff(bound))) {
+    use_implicit_method();
   } else {
-    take(options_.method == "RK45" ? rk45_ : dop853_);
-    check_at_ = may_be_stiff ? first_check : 0;
+    use_method(options_.method == "RK45" ? rk45_ : dop853_);
+    next_stiffness_check_ = may_be_stiff ? first_stiffness_check : 0;
   }
-  if (now.h == 0.0) now.h = method_->first_length(bound, method_->error_order());
+  if (now.h == 0.0) now.h = method_->initial_step_size(bound, method_->error_order());
 }
 
-void Loop::choose_again(double bound) {
+void StepLoop::choose_explicit_method(double bound) {
   if (!method_ || method_ == radau_.get() || options_.method != "auto") return;
-  const double reach = method_ == &rk45_ ? rk45_.reach_of_order_five() : dop853_.reach_of_order_five();
-  Explicit& best = bound - now.t <= few_steps * reach ? rk45_ : dop853_;
+  const double reach = method_ == &rk45_ ? rk45_.order_five_step_size() : dop853_.order_five_step_size();
+  Explicit& best = bound - now.t <= max_rk45_steps * reach ? rk45_ : dop853_;
   if (&best == method_) return;
-  take(best);
-  now.h = &best == &rk45_ ? reach : std::max(now.h, few_steps * reach);
+  use_method(best);
+  now.h = &best == &rk45_ ? reach : std::max(now.h, max_rk45_steps * reach);
 }
 
-// Until joints change next: as long as on average so far, and no less than it has lasted already.
-double Loop::lasts(double bound) const {
-  const double left = bound - now.t;
-  return restarts_ ? std::min(left, std::max((now.t - begin_.t) / static_cast<double>(restarts_), now.t - joints_at_)) : left;
+// Expected time until the next joint transition: the mean of the previous segments, at least the present duration.
+double StepLoop::segment_duration(double bound) const {
+  const double remaining = bound - now.t;
+  return joint_segments_ ? std::min(remaining, std::max((now.t - start_.t) / static_cast<double>(joint_segments_),
+                                                        now.t - joint_modes_time_))
+                         : remaining;
 }
 
-// Within the motion's present piece: where joints change, a mode that had died out is excited anew, and has to be resolved.
-bool Loop::is_stiff(double bound) {
+// Consider the present segment only: a joint transition excites modes again that had decayed, and they must be
+// resolved.
+bool StepLoop::motion_is_stiff(double bound) {
   Matrix jacobian;
   ++work.jacobians;
-  return system->jacobian(now.t, now.y, jacobian, work.rhs) && system->modes(now.y, jacobian) &&
-         stiff(jacobian, lasts(bound));
+  return system->jacobian(now.t, now.y, jacobian, work.rhs) && system->reduce_to_freedoms(now.y, jacobian) &&
+         is_stiff(jacobian, segment_duration(bound));
 }
 
-// After a while, and then after twice as long: what was not stiff at the start may have become so.
-std::optional<Stop> Loop::check_stiffness(double bound) {
-  if (!check_at_ || ++kept_ < check_at_) return {};
-  check_at_ *= 2;
-  if (const auto stop = begin(bound)) return stop;
-  if (now.t < bound && is_stiff(bound)) check_at_ = 0, take_implicit();
+// A motion that is not stiff at the start may become stiff, so check again after a while.
+std::optional<Stop> StepLoop::check_stiffness(double bound) {
+  if (!next_stiffness_check_ || ++accepted_steps_ < next_stiffness_check_) return {};
+  next_stiffness_check_ *= 2;
+  if (const auto stop = prepare_step(bound)) return stop;
+  if (now.t < bound && motion_is_stiff(bound)) next_stiffness_check_ = 0, use_implicit_method();
   return {};
 }
 

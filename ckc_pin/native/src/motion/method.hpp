@@ -1,4 +1,4 @@
-// What the step loop needs of a method, and the step that it makes.
+// Interface of the integration methods, and the step that they make.
 #pragma once
 
 #include "motion/system.hpp"
@@ -7,81 +7,80 @@ namespace ckc {
 
 struct Tolerance {
   double rtol, atol, max_step;
-  double newton = 0.2;  // of an implicit method's iteration, relative to the local error
+  double newton = 0.2;  // tolerance of an implicit method's iteration, relative to the local error
 
-  // What an error may be in each number of a step from a to b; an expression, evaluated where it is assigned.
-  auto between(const Vector& a, const Vector& b) const {
+  // Error tolerance by component in a step from a to b; an expression that is evaluated where it is assigned.
+  auto scale(const Vector& a, const Vector& b) const {
     return (rtol * a.cwiseAbs().cwiseMax(b.cwiseAbs()).array() + atol).matrix();
   }
 };
 
 struct Step {
-  double t = 0, h = 0;  // from (t, y) with rate f; h: a length to try
+  double t = 0, h = 0;  // from (t, y) with rate f; h: step size to try
   Vector y, f;
-  Vector x, x_dot;      // the whole motion there
+  Vector x, x_dot;               // full motion and its rate at t
   double t_new = 0, h_next = 0;  // to (t_new, y_new)
   Vector y_new, f_new, x_new, x_dot_new;
-  double t_old = 0;  // where the one before began
+  double t_old = 0;  // start of the previous step
   Vector y_old;
 };
 
 struct Work {
   long rhs = 0, rejected = 0, jacobians = 0, factorizations = 0;
-  long most_rhs = std::numeric_limits<long>::max();
-  bool spent = false;  // the budget was met
-  // One more right-hand side; false where none may be.
-  bool one_more() {
-    spent = rhs >= most_rhs;
-    if (!spent) ++rhs;
-    return !spent;
+  long max_rhs = std::numeric_limits<long>::max();
+  bool budget_exhausted = false;
+  // Count one right-hand side. False if the budget is exhausted.
+  bool count_rhs() {
+    budget_exhausted = rhs >= max_rhs;
+    if (!budget_exhausted) ++rhs;
+    return !budget_exhausted;
   }
 };
 
-// y within the step just made.
+// Interpolates y within the last step.
 class Interpolant {
  public:
   virtual ~Interpolant() = default;
-  virtual bool between(double t, Out y) = 0;  // false where a right-hand side does not exist
+  virtual bool interpolate(double t, Out y) = 0;  // false if a right-hand side does not exist
 };
 
 class Method : public Interpolant {
  public:
   Method(System& system, Step& step, Work& work, const Tolerance& tolerance)
       : system_(system), step_(step), work_(work), tolerance_(tolerance) {}
-  // Try steps from (t, y, f) until one is accepted; false where none can be, and then nothing is lost but the work.
-  virtual bool step(double t_bound) = 0;
-  // Forget the step just made and try one of another length next.
-  virtual void retry(double length) { step_.h = length, ++work_.rejected; }
-  // Take over the step just made.
-  virtual void commit() {
+  // Try steps from (t, y, f) until one is accepted. False if none can be; the state is then unchanged.
+  virtual bool make_step(double t_bound) = 0;
+  // Discard the last step and try another step size next.
+  virtual void reject_step(double step_size) { step_.h = step_size, ++work_.rejected; }
+  // Make the end of the last step the present state.
+  virtual void accept_step() {
     step_.t_old = step_.t, step_.y_old = step_.y;
     step_.t = step_.t_new, step_.y = step_.y_new, step_.f = step_.f_new, step_.h = step_.h_next;
     step_.x.swap(step_.x_new), step_.x_dot.swap(step_.x_dot_new);
   }
-  // Remember nothing of former steps.
-  virtual void forget() {}
+  // Forget previous steps.
+  virtual void reset_history() {}
   virtual const char* name() const = 0;
-  // A first length, of a method whose error estimate is of this order; (t, y, f) are known.
-  double first_length(double t_bound, int order);
+  // Initial step size for a method with an error estimate of this order; (t, y, f) are known.
+  double initial_step_size(double t_bound, int order);
   virtual int error_order() const = 0;
 
-  // The rate where the next step begins, and the whole motion there.
+  // Evaluate the rate and the full motion at the start of the next step.
   bool evaluate_start();
 
-  bool evaluate(double t, In y, Out y_dot) {
-    return work_.one_more() && system_.rhs(t, y, y_dot);
-  }
+  bool evaluate(double t, In y, Out y_dot) { return work_.count_rhs() && system_.rhs(t, y, y_dot); }
 
  protected:
-  // Whether a shorter step would be of no use.
-  bool over() const { return work_.spent || system_.control.problem.raised; }
-  // The shortest step that changes t.
-  double shortest(double t_bound) const;
-  // Where y is only a part of the motion, the rest has to agree with what its rates add up to: next to where y stops to
-  // determine it, or on another branch, it does not, however small the error of y is.
-  bool whole(double h) const { return step_.x.size() && h <= system_.whole_within(); }
-  double disagreement(In integral);  // of the rates, relative to what is allowed
-  // A step was refused for that. Find the state where it begins once more, as closed as it can be.
+  // Whether shorter steps would not help.
+  bool must_stop() const { return work_.budget_exhausted || system_.control.failure.raised; }
+  // Smallest step size that changes t.
+  double min_step_size(double t_bound) const;
+  // Whether to check the full motion in a step of size h. If y is only a part of the motion, the rest must agree with
+  // the integral of its rates. Near a singular phi_z or on another branch it does not, however small the error of y
+  // is.
+  bool checks_full_motion(double h) const { return step_.x.size() && h <= system_.full_motion_max_step(); }
+  double disagreement(In integral);  // of the full motion with the integral of its rates, relative to the tolerance
+  // After a step was rejected for a disagreement: project its start again, more exactly.
   bool return_to_start();
 
   double norm(In x, const Vector& scale) const {

@@ -1,4 +1,4 @@
-// Eq. 8 as printed, y = (q, q_dot, z). Trees without free roots only.
+// Eq. 8 as printed in the paper, y = (q, q_dot, z). Only for trees without free roots.
 #pragma once
 
 #include "motion/system.hpp"
@@ -11,21 +11,21 @@ class PrintedSpf : public System {
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool rhs(double t, In y, Out y_dot) override;
-  bool exact(double t, In y) override;
-  bool at_last(double t, In y) override { return exact(t, y); }
-  double margin() override { return phi_z_margin(); }
-  Accepted accept(double t, Out y, double margin) override;
-  void rates(std::vector<std::pair<int, int>>& of) const override {
+  bool sync_core(double t, In y) override;
+  bool sync_core_at_last_rhs(double t, In y) override { return sync_core(t, y); }
+  double coordinate_margin() override { return phi_z_margin(); }
+  Accepted accept_step(double t, Out y, double margin) override;
+  void rate_pairs(std::vector<std::pair<int, int>>& of) const override {
     of.clear();
     for (int k = 0; k < core.d; ++k) of.emplace_back(k, core.d + k);
   }
-  double decay() const override { return -1.0 / epsilon_; }
+  double w_decay_rate() const override { return -1.0 / epsilon_; }
   bool tree_acceleration(In, Out) const override { return false; }
-  void push(Out, In) const override {}  // joints of such a motion neither rub nor stop
-  void shift(Out, In) const override {}
+  void add_velocity(Out, In) const override {}  // joints have no friction or stops in this formulation
+  void add_displacement(Out, In) const override {}
 
  private:
-  void place(double t, In y);  // the core at the state; z_dot_ with phi as it is
+  void set_state(double t, In y);  // of the core; z_dot_ is evaluated at the actual phi
 
   const double epsilon_;
   const bool actual_;

@@ -1,8 +1,8 @@
-// Radau IIA: implicit collocation of order 5, 9 or 13, stiffly accurate, in one step, so that projection, events and
-// held forces do it no harm.
+// Radau IIA: implicit collocation of order 5, 9 or 13. It is stiffly accurate and a one-step method, so projections,
+// events and held forces do not disturb it.
 //
-// After E. Hairer and G. Wanner, Stiff differential equations solved by Radau methods, 1999; but the Jacobian is taken
-// ahead, where the last step's polynomial leads, which saves half the Newton iterations of a controlled motion.
+// After E. Hairer and G. Wanner, Stiff differential equations solved by Radau methods, 1999. The Jacobian is
+// evaluated ahead, on the extrapolated last polynomial, which halves the Newton iterations of controlled motions.
 #pragma once
 
 #include <complex>
@@ -17,90 +17,91 @@ class Radau : public Method {
  public:
   Radau(System& system, Step& step, Work& work, const Tolerance& tolerance);
 
-  bool step(double t_bound) override;
-  bool between(double t, Out y) override;
-  void retry(double length) override;
-  void commit() override;
-  void forget() override;
+  bool make_step(double t_bound) override;
+  bool interpolate(double t, Out y) override;
+  void reject_step(double step_size) override;
+  void accept_step() override;
+  void reset_history() override;
   const char* name() const override { return "Radau"; }
   int error_order() const override { return stages_; }
 
  private:
   using Complex = std::complex<double>;
 
-  // A collocation polynomial from y at t on: its rate's series in Legendre's polynomials.
+  // A collocation polynomial from (t, y), as a Legendre series of its rate.
   struct Polynomial {
     Matrix series;
     Vector y;
     double t = 0.0, h = 0.0;
   };
-  void integrals(double x);
+  void evaluate_legendre_integrals(double x);
   using Method::evaluate;
   void evaluate(const Polynomial& polynomial, double t, Out y);
 
   enum class Newton { converged, slow, impossible };
   void tabulate();
-  void guess(double h);
-  void extrapolate(double x, double h, Out y);  // y at t + x h, by the last step's polynomial
+  void extrapolate_stages(double h);
+  void extrapolate(double x, double h, Out y);  // at t + x h
   bool new_jacobian(double h);
   void factorize(double h);
-  void solve();
-  Newton newton(double h);
-  double error(const Vector& f, double h);
-  void propose(double h, double size, double effort, double exponent);
+  void solve_linear_system();
+  Newton iterate(double h);
+  double estimate_error(const Vector& f, double h);
+  void propose_step_size(double h, double size, double effort, double exponent);
 
-  const int stages_, most_iterations_;
-  Vector c_, e_;        // nodes; weights of the error estimate
+  const int stages_, max_iterations_;
+  Vector c_, e_;  // nodes; weights of the error estimate
   Matrix A_inverse_, to_series_;
-  Vector basis_;        // the integrals of Legendre's polynomials somewhere
-  Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1, one of each pair
+  Vector legendre_integrals_;       // integrals of the Legendre polynomials at one point
+  Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1; one of each conjugate pair
   Eigen::VectorXcd lambda_;
 
-  // A block of the Jacobian, of numbers that move by themselves: the motion's, or a column's that y has beside it.
+  // A diagonal block of the Jacobian: of the motion, or of one auxiliary column.
   struct Block {
     Matrix J;
-    std::vector<std::pair<int, int>> rates;  // entries whose rate is another entry
-    Indices rest, place;  // those that are not eliminated; where an entry is among them, else -1
-    void begin();         // `rest` and `place` from `rates`
+    std::vector<std::pair<int, int>> rates;  // (i, j): the rate of entry i is entry j
+    Indices remaining, position;             // entries that are not eliminated; index among them by entry, else -1
+    void update_indices();                   // from `rates`
   };
 
-  // lambda / h - J of a block, with the entries whose rate is another entry eliminated: x_i = h / lambda (b_i + x_j).
+  // The factorized matrix lambda / h - J of a block. Entries whose rate is another entry are eliminated: x_i = h /
+  // lambda (b_i + x_j).
   template <class Scalar>
-  struct Shifted {
+  struct ShiftedBlock {
     using Square = Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic>;
     using Column = Eigen::Matrix<Scalar, Eigen::Dynamic, 1>;
     Scalar shift;
-    Square left;
-    Column right, rest;
+    Square matrix;
+    Column solution, rhs;
     Eigen::PartialPivLU<Square> lu;
     void compute(const Block& of, Scalar shift);
     void solve(const Block& of, const Eigen::Ref<const Column>& b, Eigen::Ref<Column> x);
   };
 
-  // And of all of y: columns beside the motion are alike.
+  // The factorization for all of y. All auxiliary columns have the same block.
   template <class Scalar>
   struct Factors {
-    Shifted<Scalar> motion, beside;
+    ShiftedBlock<Scalar> motion, auxiliary;
     void compute(const Radau& of, Scalar shift);
-    void solve(const Radau& of, const Eigen::Ref<const typename Shifted<Scalar>::Column>& b,
-               Eigen::Ref<typename Shifted<Scalar>::Column> x);
+    void solve(const Radau& of, const Eigen::Ref<const typename ShiftedBlock<Scalar>::Column>& b,
+               Eigen::Ref<typename ShiftedBlock<Scalar>::Column> x);
   };
 
   Matrix Z_, F_, dZ_;
-  Matrix Z_dot_, X_;  // rates of the collocation polynomials, and with them of the whole motion
+  Matrix Z_dot_, X_;  // rates of the polynomials at the stages, and of the full motion
   Vector b_, x_stage_;
-  Block motion_, beside_;
-  bool alike_ = false;                    // columns beside the motion move as it does
-  Factors<double> real_;                  // of the real eigenvalue
-  std::vector<Factors<Complex>> pairs_;   // of the others
-  Eigen::VectorXcd right_, correction_;
+  Block motion_block_, auxiliary_block_;
+  bool blocks_are_equal_ = false;                  // the auxiliary block equals that of the motion
+  Factors<double> real_factors_;                   // of the real eigenvalue
+  std::vector<Factors<Complex>> complex_factors_;  // of the complex pairs
+  Eigen::VectorXcd complex_rhs_, complex_correction_;
   Vector scale_, error_, y_stage_, f_stage_, real_right_, real_correction_;
-  double factorized_ = 0.0;  // the length that the factors are of
-  bool J_known_ = false, J_fresh_ = false;
+  double factorized_step_ = 0.0;  // step size of the factorization
+  bool jacobian_is_valid_ = false, jacobian_is_fresh_ = false;
   double contraction_ = 0.0, correction_size_ = 0.0;
-  int iterations_ = 0, cautious_ = 0;
-  double error_old_ = 0.0, length_old_ = 0.0, error_new_ = 0.0;
-  Polynomial last_, made_;   // of the last step, and of the one just made
+  int iterations_ = 0, cautious_steps_left_ = 0;
+  double error_old_ = 0.0, h_old_ = 0.0, error_new_ = 0.0;
+  Polynomial last_polynomial_, step_polynomial_;  // of the last accepted step, and of the new one
 };
 
 }  // namespace ckc

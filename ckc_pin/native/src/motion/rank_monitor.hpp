@@ -1,8 +1,8 @@
 // Monitors J for a loss of rank, where branches of the motion meet.
 //
-// At a change point (a flat four-bar) the loops stop to determine the motion: a step that passes over it can come out
-// on the other branch, within tolerance and wrong. The least singular value s(t) of J shows it as a V that reaches zero:
-// falling at the start of a step, rising at its end. In such a step the least value is searched for.
+// At a change point (such as a flat four-bar) the loops do not determine the motion. A step across it may end on the
+// other branch, within tolerance but wrong. The smallest singular value s(t) of J then has a V that reaches zero: it
+// falls at the start of the step and rises at its end. The minimum is searched for in such steps.
 #pragma once
 
 #include <limits>
@@ -18,44 +18,43 @@ class RankMonitor {
  public:
   explicit RankMonitor(const Core& core);
 
-  // J's least singular value that is not zero over the root mean square of all such, free of units, and its rate.
+  // Smallest nonzero singular value of J over the root mean square of all of them, dimensionless, and its rate.
   struct Rank {
     double value = 1.0, rate = 0.0;
   };
-  Rank at(System& system);  // at the core's present state, moving with system.velocity
+  Rank evaluate(System& system);  // at the core's state, moving with system.velocity
 
-  // Whether J has kept its rank.
-  static bool kept(const Rank& at) { return at.value >= lost && std::isfinite(at.rate); }
-  // Whether a position where J loses rank may be so near that it has to be looked for.
-  static bool ahead(const Rank& end, double length);
-  // How much of a step of length h between two values to make: all where it passes no loss of rank, a part where it is
-  // too long to tell; NaN where only what is between its ends tells.
-  static double part(const Rank& before, const Rank& after, double h);
-  // The same of a step of which the least value in between is known, and is above `lost`.
-  static double part(const Rank& before, const Rank& after, double h, double least);
+  static bool has_rank(const Rank& rank) { return rank.value >= rank_lost && std::isfinite(rank.rate); }
+  // Whether a loss of rank of J may lie within the next steps.
+  static bool may_lose_rank_ahead(const Rank& end, double length);
+  // Fraction of a step of size h that can be accepted, given the values at its ends: 1 if it contains no loss of
+  // rank, less if it is too long to tell, NaN if the interior must be searched.
+  static double step_fraction(const Rank& before, const Rank& after, double h);
+  // The same if the minimum within the step is known and larger than `rank_lost`.
+  static double step_fraction(const Rank& before, const Rank& after, double h, double minimum);
 
-  static constexpr double lost = 1e-5;
+  static constexpr double rank_lost = 1e-5;
 
-  // When that value is least on a motion, to 2^(1 - bits) of the interval, and how large it is then.
-  struct Least {
+  // Find the minimum of the value along a motion, with an accuracy of 2^(1 - bits) of the interval.
+  struct Minimum {
     double t, value;
   };
-  // `motion`: sets the core to where it is at an instant; false where it does not exist.
+  // `motion` sets the core to the configuration at a time; false if that does not exist.
   template <class Motion>
-  Least least(Core& core, const Motion& motion, double from, double to, int bits) {
+  Minimum find_minimum(Core& core, const Motion& motion, double from, double to, int bits) {
     const double h = to - from;
     const auto value = [&](double x) {
       return motion(from + (x - 1) * h) ? this->value(core) : std::numeric_limits<double>::infinity();
     };
-    const auto [x, least] = boost::math::tools::brent_find_minima(value, 1.0, 2.0, bits);
-    return {from + (x - 1) * h, least};
+    const auto [x, minimum] = boost::math::tools::brent_find_minima(value, 1.0, 2.0, bits);
+    return {from + (x - 1) * h, minimum};
   }
 
  private:
   double value(Core& core);
 
   Vector v_, u_;
-  Spectrum spectrum_;  // of J, scaled
+  SmallestSingularValue smallest_singular_value_;  // of the scaled J
 };
 
 }  // namespace ckc

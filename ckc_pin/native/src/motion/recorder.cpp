@@ -5,50 +5,52 @@
 
 namespace ckc {
 
-static int width_of(const System& system) {
+static int row_width(const System& system) {
   const Core& core = system.core;
-  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.rows.closure.rows + system.extra();
+  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.constraints.closure.rows +
+         system.extra_columns();
 }
 
-Recorder::Recorder(const System& system) : width(width_of(system)) { momentum_.setZero(system.core.n); }
+Recorder::Recorder(const System& system) : width(row_width(system)) { momentum_.setZero(system.core.n); }
 
-void Recorder::begin(Vector instants, double* rows, Eigen::Index most) {
-  instants_ = std::move(instants), rows_ = rows, most_ = most, next_ = filled = 0;
+void Recorder::start(Vector instants, double* rows, Eigen::Index max_rows) {
+  instants_ = std::move(instants), rows_ = rows, max_rows_ = max_rows, next_ = filled = 0;
 }
 
 bool Recorder::add(System& system, double t, In y) {
-  if (full() || (filled && t <= rows_[(filled - 1) * width])) return true;
-  Eigen::Map<Vector> place(rows_ + filled * width, width);
-  if (!row(system, t, y, place)) return false;
+  if (is_full() || (filled && t <= rows_[(filled - 1) * width])) return true;
+  Eigen::Map<Vector> row(rows_ + filled * width, width);
+  if (!fill_row(system, t, y, row)) return false;
   ++filled;
   return true;
 }
 
-bool Recorder::row(System& system, double t, In y, Out row) {
+bool Recorder::fill_row(System& system, double t, In y, Out row) {
   Core& core = system.core;
-  const int n = core.n, d = core.d, m = core.rows.closure.rows;
+  const int n = core.n, d = core.d, m = core.constraints.closure.rows;
   const auto actuators = system.control.tau.size();
-  if (!system.exact(t, y)) return false;
+  if (!system.sync_core(t, y)) return false;
   const Energy energy = core.energy(system.v_tree, momentum_);
   core.set_velocity(system.v_tree);
-  if (!system.act(t)) return false;
-  system.control.settle_u(core);
+  if (!system.compute_control(t)) return false;
+  system.control.recover_u(core);
   Eigen::Index at = 0;
-  const auto put = [&](In part) { row.segment(at, part.size()) = part, at += part.size(); };
+  const auto append = [&](In part) { row.segment(at, part.size()) = part, at += part.size(); };
   row(at++) = t;
   core.tree.to_coordinates(core.q_tree, row.segment(at, n)), at += n;
-  put(system.velocity), put(system.control.u.head(d)), put(system.control.tau.head(actuators));
-  put(core.rows.phi), put(system.w);
+  append(system.velocity), append(system.control.u.head(d)), append(system.control.tau.head(actuators));
+  append(core.constraints.phi), append(system.w);
   row(at++) = energy.total();
-  row(at++) = core.joints.dissipated(row.segment(1, n));
-  row(at++) = system.control.lyapunov(system.measured(t), energy.potential, core.rows.phi);
-  double open = 0.0, opening = 0.0;
+  row(at++) = core.joints.dissipated_energy(row.segment(1, n));
+  row(at++) = system.control.lyapunov(system.measured(t), energy.potential, core.constraints.phi);
+  double max_phi_error = 0.0, max_phi_dot_error = 0.0;
   for (int i = 0; i < m; ++i) {
-    open = std::max(open, std::abs(core.rows.phi(i) - system.w(i)));
-    opening = std::max(opening, std::abs(core.rows.J.row(i).dot(system.velocity) - system.decay() * system.w(i)));
+    max_phi_error = std::max(max_phi_error, std::abs(core.constraints.phi(i) - system.w(i)));
+    max_phi_dot_error = std::max(max_phi_dot_error, std::abs(core.constraints.J.row(i).dot(system.velocity) -
+                                                             system.w_decay_rate() * system.w(i)));
   }
-  row(at++) = open, row(at++) = opening;
-  system.put_extra(y, row.tail(system.extra()));
+  row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
+  system.write_extra_columns(y, row.tail(system.extra_columns()));
   return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }
 

@@ -1,4 +1,4 @@
-// What a run keeps at its output instants, a row each.
+// Records the state at the output instants of a run, one row each.
 #pragma once
 
 #include "motion/system.hpp"
@@ -9,28 +9,28 @@ class Recorder {
  public:
   explicit Recorder(const System& system);
 
-  // t, q', velocity, u, tau, phi, w, energy, energy that friction and impacts took, Lyapunov
-  // function, largest |phi - w|, largest |phi_dot - w_dot|, what the system adds
+  // t, q', velocity, u, tau, phi, w, energy, energy dissipated by friction and impacts, Lyapunov function, largest
+  // |phi - w|, largest |phi_dot - w_dot|, extra columns of the system
   const int width;
 
-  void begin(Vector instants, double* rows, Eigen::Index most);  // rows: most by width
-  bool due(double t) const { return next_ < instants_.size() && instants_(next_) <= t && filled < most_; }
-  double instant() const { return instants_(next_); }
-  bool full() const { return filled == most_; }
-  // Record the state at (t, y), unless that instant is recorded already; false where the state has no terms.
+  void start(Vector instants, double* rows, Eigen::Index max_rows);  // (max_rows, width)
+  bool is_due(double t) const { return next_ < instants_.size() && instants_(next_) <= t && filled < max_rows_; }
+  double next_instant() const { return instants_(next_); }
+  bool is_full() const { return filled == max_rows_; }
+  // Record the state at (t, y) unless that instant is already recorded. False if the state cannot be evaluated.
   bool add(System& system, double t, In y);
-  void passed() { ++next_; }
-  // Remove the last row if it is of time t, so that another state can be recorded there.
+  void advance_instant() { ++next_; }
+  // Remove the last row if its time is t, so that another state can be recorded there.
   void drop_row_at(double t) { filled -= filled && rows_[(filled - 1) * width] >= t; }
 
   Eigen::Index filled = 0;
 
  private:
-  bool row(System& system, double t, In y, Out row);
+  bool fill_row(System& system, double t, In y, Out row);
 
   Vector instants_, momentum_;
   double* rows_ = nullptr;
-  Eigen::Index most_ = 0, next_ = 0;
+  Eigen::Index max_rows_ = 0, next_ = 0;
 };
 
 }  // namespace ckc

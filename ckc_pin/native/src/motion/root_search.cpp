@@ -9,32 +9,33 @@
 
 namespace ckc {
 
-constexpr double rounding = 1e-12;    // of the largest value in the step: counts as zero
-constexpr double near_zero = 0.25;    // of the function's range in the step: an extremum so near to zero is refined
-constexpr double t_tolerance = 1e-12; // s
-constexpr int most_steps = 6;         // of the secant method from a root that is nearly right,
-constexpr double secant = 1e-3;       // of the step: over which it begins; of its first step, what that may be wrong by
-constexpr int fine = 64;              // places at which the polynomial's extrema are looked for
-constexpr int tip_bits = 30;          // how closely the tip of a kink is searched for
-constexpr double unsure = 10.0;       // times what the cheap function is off by: an extremum so near to zero may cross
+constexpr double zero_rounding = 1e-12;        // of the largest value in the step: smaller values count as zero
+constexpr double max_extremum_ratio = 0.25;    // of the function's range in the step: closer extrema are refined
+constexpr double root_time_tolerance = 1e-12;  // s
+constexpr int max_secant_steps = 6;            // from an approximate root
+constexpr double secant_width = 1e-3;          // of the step: width of the first secant, and relative error of its step
+constexpr int fine_points_per_degree = 64;     // points per degree at which extrema of the polynomial are searched
+constexpr int kink_search_bits = 30;           // accuracy of the search for a kink
+// times the error of the cheap function: closer extrema may touch zero
+constexpr double max_exact_difference_ratio = 10.0;
 
 namespace {
 
-// From values at the places to Chebyshev coefficients, and from those to the fine places.
+// Maps values at the sample points to values of their interpolating polynomial at fine points.
 struct Chebyshev {
   Matrix to_fine;
-  Vector fine_places;
+  Vector fine_points;
   Chebyshev() {
-    const int n = walk_degree;
+    const int n = sample_degree;
     const auto polynomials = [](const Vector& x) {
-      Matrix values(x.size(), walk_degree + 1);
+      Matrix values(x.size(), sample_degree + 1);
       for (Eigen::Index i = 0; i < x.size(); ++i)
-        for (int k = 0; k <= walk_degree; ++k) values(i, k) = std::cos(k * std::acos(std::clamp(x(i), -1.0, 1.0)));
+        for (int k = 0; k <= sample_degree; ++k) values(i, k) = std::cos(k * std::acos(std::clamp(x(i), -1.0, 1.0)));
       return values;
     };
-    const Vector x = 2 * walk_places().array() - 1;
-    fine_places = Vector::LinSpaced(n * fine + 1, 0.0, 1.0);
-    to_fine = polynomials(2 * fine_places.array() - 1) * polynomials(x).inverse();
+    const Vector x = 2 * sample_points().array() - 1;
+    fine_points = Vector::LinSpaced(n * fine_points_per_degree + 1, 0.0, 1.0);
+    to_fine = polynomials(2 * fine_points.array() - 1) * polynomials(x).inverse();
   }
 };
 
@@ -43,140 +44,144 @@ const Chebyshev& chebyshev() {
   return once;
 }
 
-void insert(Points& points, double t, double value) {
-  const auto at = std::lower_bound(points.begin(), points.end(), t, [](const auto& p, double t) { return p.first < t; });
+void insert_point(Points& points, double t, double value) {
+  const auto at =
+      std::lower_bound(points.begin(), points.end(), t, [](const auto& p, double t) { return p.first < t; });
   if (at == points.end() || at->first != t) points.insert(at, {t, value});
 }
 
-// Add the points between the given ones where the function comes nearest to zero.
-bool with_extrema(const Gap& gap, double from, double to, In values, double zero, Walk& walked) {
-  Points &points = walked.points, &tips = walked.tips;
-  const double spread = values.maxCoeff() - values.minCoeff();
-  if (!(values.cwiseAbs().minCoeff() <= spread)) return true;  // too far from zero to reach it and come back
-  Vector& curve = walked.curve;
-  curve.noalias() = chebyshev().to_fine * values;
-  for (Eigen::Index i = 1; i + 1 < curve.size(); ++i) {
-    const double before = curve(i) - curve(i - 1), after = curve(i + 1) - curve(i);
-    if (!(before * after < 0.0)) continue;
-    const double step = chebyshev().fine_places(1), shift = 0.5 * (before + after) / (before - after);
-    const double t = from + (to - from) * (chebyshev().fine_places(i) + shift * step);
-    double value;
-    if (!gap(t, value)) return false;
-    insert(points, t, value);
-  }
-  tips.clear();
-  for (size_t k = 0; k < points.size(); ++k) {
-    const auto& [t, value] = points[k];
-    const auto &left = points[k ? k - 1 : 0], &right = points[std::min(k + 1, points.size() - 1)];
-    const bool nearest = value * left.second > 0 && value * right.second > 0 &&
-                         std::abs(value) <= std::abs(left.second) && std::abs(value) <= std::abs(right.second);
-    if (!nearest || !(std::abs(value) > zero) || !(std::abs(value) < near_zero * spread)) continue;
-    const double sign = value > 0 ? 1.0 : -1.0, width = right.first - left.first, start = left.first;
-    bool exists = true;
-    const auto height = [&](double x) {
-      double found = 0.0;
-      exists = exists && gap(start + (x - 1) * width, found);
-      return sign * found;
-    };
-    const auto [x, least] = boost::math::tools::brent_find_minima(height, 1.0, 2.0, tip_bits);
-    if (!exists) return false;
-    tips.emplace_back(start + (x - 1) * width, sign * least);
-  }
-  for (const auto& [t, value] : tips) insert(points, t, value);
-  return true;
-}
-
-bool root(const Gap& gap, const std::pair<double, double>& start, const std::pair<double, double>& end, double& t) {
+bool find_root(const ScalarFunction& function, const std::pair<double, double>& start,
+               const std::pair<double, double>& end, double& t) {
   t = start.first;
-  if (start.second * end.second >= 0) return true;  // zero at the start of the step, or by what counts as zero
+  if (start.second * end.second >= 0) return true;  // zero at the start of the step, or within the threshold
   bool exists = true;
-  const auto value = [&](double at) {
-    double found = start.second;
-    exists = exists && gap(at, found);
-    return found;
+  const auto evaluate = [&](double at) {
+    double value = start.second;
+    exists = exists && function(at, value);
+    return value;
   };
-  const auto close = [](double a, double b) {
-    return std::abs(b - a) <= t_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(a);
+  const auto is_close = [](double a, double b) {
+    return std::abs(b - a) <= root_time_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(a);
   };
-  std::uintmax_t most = 200;
-  const auto [a, b] = boost::math::tools::toms748_solve(value, start.first, end.first, start.second, end.second, close, most);
+  std::uintmax_t max_iterations = 200;
+  const auto [a, b] = boost::math::tools::toms748_solve(evaluate, start.first, end.first, start.second, end.second,
+                                                        is_close, max_iterations);
   t = 0.5 * (a + b);
   return exists;
 }
 
-// From a root of `gap` to the one next to it of the function that gap is off from by little.
-bool refine(const Gap& gap, const Gap& exact, const std::pair<double, double>& start,
-            const std::pair<double, double>& end, double& t) {
-  const double width = secant * (end.first - start.first), rough = t;
-  const double left = std::max(t - width, start.first), right = std::min(t + width, end.first);
-  double below, above;
-  if (!gap(left, below) || !gap(right, above)) return false;
-  double slope = (above - below) / (right - left), at = t, before = t, value_before = 0.0, value;
-  for (int k = 0; k < most_steps && slope * end.second > 0.0; ++k) {
+// Improve a root of the approximate function to a root of the exact one.
+bool refine_root(const ScalarFunction& function, const ScalarFunction& exact, const std::pair<double, double>& start,
+                 const std::pair<double, double>& end, double& t) {
+  const double width = secant_width * (end.first - start.first), initial_t = t;
+  const double lower = std::max(t - width, start.first), upper = std::min(t + width, end.first);
+  double value_below, value_above;
+  if (!function(lower, value_below) || !function(upper, value_above)) return false;
+  double slope = (value_above - value_below) / (upper - lower), at = t, previous_t = t, value_before = 0.0, value;
+  for (int k = 0; k < max_secant_steps && slope * end.second > 0.0; ++k) {
     if (!exact(at, value)) return false;
-    if (k && value != value_before) slope = (value - value_before) / (at - before);
-    const double step = value / slope, accuracy = t_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(at);
-    before = at, value_before = value;
+    if (k && value != value_before) slope = (value - value_before) / (at - previous_t);
+    const double step = value / slope,
+                 accuracy = root_time_tolerance + 4 * std::numeric_limits<double>::epsilon() * std::abs(at);
+    previous_t = at, value_before = value;
     at = std::clamp(at - step, start.first, end.first);
-    if (!(std::abs(step) * (k ? 1.0 : secant) > accuracy)) return t = at, true;
+    if (!(std::abs(step) * (k ? 1.0 : secant_width) > accuracy)) return t = at, true;
   }
   double first, last;
   if (!exact(start.first, first) || !exact(end.first, last)) return false;
-  t = rough;
-  return first * last < 0.0 ? root(exact, {start.first, first}, {end.first, last}, t) : true;
+  t = initial_t;
+  return first * last < 0.0 ? find_root(exact, {start.first, first}, {end.first, last}, t) : true;
 }
 
-// Whether the function that gap is off from by little may touch zero where gap does not, or not where gap does.
-bool grazes(const Gap& exact, double spread, const Points& points, bool& may) {
-  may = false;
-  for (size_t k = 1; k + 1 < points.size() && !may; ++k) {
+// Whether the exact function may touch zero where the approximate one does not, or the other way round.
+bool may_touch_zero(const ScalarFunction& exact, double range, const Points& points, bool& may_touch) {
+  may_touch = false;
+  for (size_t k = 1; k + 1 < points.size() && !may_touch; ++k) {
     const auto& [t, value] = points[k];
     const bool extreme = (value - points[k - 1].second) * (value - points[k + 1].second) >= 0.0;
-    if (!extreme || !(std::abs(value) < near_zero * spread)) continue;
-    double there;
-    if (!exact(t, there)) return false;
-    may = std::abs(value) <= unsure * std::abs(there - value);
+    if (!extreme || !(std::abs(value) < max_extremum_ratio * range)) continue;
+    double exact_value;
+    if (!exact(t, exact_value)) return false;
+    may_touch = std::abs(value) <= max_exact_difference_ratio * std::abs(exact_value - value);
   }
   return true;
 }
 
 }  // namespace
 
-const Vector& walk_places() {
-  static const Vector once =
-      Vector::NullaryExpr(walk_degree + 1, [](Eigen::Index k) { return (1.0 - std::cos(M_PI * k / walk_degree)) / 2; });
+const Vector& sample_points() {
+  static const Vector once = Vector::NullaryExpr(
+      sample_degree + 1, [](Eigen::Index k) { return (1.0 - std::cos(M_PI * k / sample_degree)) / 2; });
   return once;
 }
 
-bool walk(const Gap& gap, double from, double to, In values, int sign, double floor, Walk& walked, const Gap* exact) {
-  const double zero = std::max(floor, rounding * values.cwiseAbs().maxCoeff());
-  const Vector& places = walk_places();
-  Points& points = walked.points;
-  points.clear();
-  for (Eigen::Index k = 0; k < places.size(); ++k)
-    points.emplace_back(k + 1 == places.size() ? to : from + (to - from) * places(k), values(k));
-  if (!with_extrema(gap, from, to, values, zero, walked)) return false;
-  bool may = false;
-  if (exact && !grazes(*exact, values.maxCoeff() - values.minCoeff(), points, may)) return false;
-  if (may) {
-    Vector& exact_values = walked.exact_values;
-    exact_values.resize(places.size());
-    for (Eigen::Index k = 0; k < places.size(); ++k)
-      if (!(*exact)(k + 1 == places.size() ? to : from + (to - from) * places(k), exact_values(k))) return false;
-    return walk(*exact, from, to, exact_values, sign, floor, walked);
+// Add points between the samples where the function is closest to zero.
+bool RootSearch::add_extrema(const ScalarFunction& function, Interval step, In values, double zero) {
+  const double range = values.maxCoeff() - values.minCoeff();
+  if (!(values.cwiseAbs().minCoeff() <= range)) return true;  // too far from zero to reach it and return
+  fine_values_.noalias() = chebyshev().to_fine * values;
+  for (Eigen::Index i = 1; i + 1 < fine_values_.size(); ++i) {
+    const double slope_before = fine_values_(i) - fine_values_(i - 1),
+                 slope_after = fine_values_(i + 1) - fine_values_(i);
+    if (!(slope_before * slope_after < 0.0)) continue;
+    const double spacing = chebyshev().fine_points(1),
+                 shift = 0.5 * (slope_before + slope_after) / (slope_before - slope_after);
+    const double t = step.at(chebyshev().fine_points(i) + shift * spacing);
+    double value;
+    if (!function(t, value)) return false;
+    insert_point(points_, t, value);
   }
-  walked.found.clear(), walked.sign = sign, walked.on_zero = false, walked.always_on_zero = true;
-  auto last = points.front();
-  for (const auto& point : points) {
-    const int now = std::abs(point.second) <= zero ? 0 : point.second > 0 ? 1 : -1;
-    walked.on_zero = now == 0, walked.always_on_zero &= now == 0;
-    if (now && walked.sign && walked.sign != now) {
+  kinks_.clear();
+  for (size_t k = 0; k < points_.size(); ++k) {
+    const auto& [t, value] = points_[k];
+    const auto &lower = points_[k ? k - 1 : 0], &upper = points_[std::min(k + 1, points_.size() - 1)];
+    const bool nearest = value * lower.second > 0 && value * upper.second > 0 &&
+                         std::abs(value) <= std::abs(lower.second) && std::abs(value) <= std::abs(upper.second);
+    if (!nearest || !(std::abs(value) > zero) || !(std::abs(value) < max_extremum_ratio * range)) continue;
+    const double sign = value > 0 ? 1.0 : -1.0, width = upper.first - lower.first, start = lower.first;
+    bool exists = true;
+    const auto signed_value = [&](double x) {
+      double value = 0.0;
+      exists = exists && function(start + (x - 1) * width, value);
+      return sign * value;
+    };
+    const auto [x, minimum] = boost::math::tools::brent_find_minima(signed_value, 1.0, 2.0, kink_search_bits);
+    if (!exists) return false;
+    kinks_.emplace_back(start + (x - 1) * width, sign * minimum);
+  }
+  for (const auto& [t, value] : kinks_) insert_point(points_, t, value);
+  return true;
+}
+
+bool RootSearch::find(const ScalarFunction& function, Interval step, In values, int sign_before, double zero_threshold,
+                      const ScalarFunction* exact) {
+  const double zero = std::max(zero_threshold, zero_rounding * values.cwiseAbs().maxCoeff());
+  const Vector& positions = sample_points();
+  const auto time_of = [&](Eigen::Index k) { return k + 1 == positions.size() ? step.to : step.at(positions(k)); };
+  points_.clear();
+  for (Eigen::Index k = 0; k < positions.size(); ++k) points_.emplace_back(time_of(k), values(k));
+  if (!add_extrema(function, step, values, zero)) return false;
+  bool may_touch = false;
+  if (exact && !may_touch_zero(*exact, values.maxCoeff() - values.minCoeff(), points_, may_touch)) return false;
+  if (may_touch) {
+    exact_values_.resize(positions.size());
+    for (Eigen::Index k = 0; k < positions.size(); ++k)
+      if (!(*exact)(time_of(k), exact_values_(k))) return false;
+    return find(*exact, step, exact_values_, sign_before, zero_threshold);
+  }
+  sign_changes.clear(), sign = sign_before, on_zero = false, always_on_zero = true;
+  auto previous = points_.front();
+  for (const auto& point : points_) {
+    const int sign_here = std::abs(point.second) <= zero ? 0 : point.second > 0 ? 1 : -1;
+    on_zero = sign_here == 0, always_on_zero &= sign_here == 0;
+    if (sign_here && sign && sign != sign_here) {
       double t;
-      if (!root(gap, last, point, t)) return false;
-      if (exact && last.second * point.second < 0.0 && !refine(gap, *exact, last, point, t)) return false;
-      walked.found.emplace_back(t, now);
+      if (!find_root(function, previous, point, t)) return false;
+      if (exact && previous.second * point.second < 0.0 && !refine_root(function, *exact, previous, point, t))
+        return false;
+      sign_changes.emplace_back(t, sign_here);
     }
-    if (now) walked.sign = now, last = point;
+    if (sign_here) sign = sign_here, previous = point;
   }
   return true;
 }

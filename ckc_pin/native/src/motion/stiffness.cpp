@@ -7,18 +7,19 @@
 
 namespace ckc {
 
-constexpr double life = 30;  // time constants after which a mode is over
-constexpr double gain = 3;   // how much longer than it has to be resolved a mode has to bind an explicit method
+constexpr double lifetime_time_constants = 30;  // time constants after which a mode has decayed
+constexpr double min_gain = 3;  // an explicit method must need this many times the steps that accuracy requires
 
-bool stiff(const Matrix& jacobian, double duration) {
+bool is_stiff(const Matrix& jacobian, double duration) {
   const Eigen::EigenSolver<Matrix> solver(jacobian, false);
   double bound = 0.0, resolved = 0.0;
   for (const auto& mode : solver.eigenvalues()) {
     const double rate = std::abs(mode), decay = -mode.real();
     if (decay > 0.0) bound = std::max(bound, rate * duration);
-    resolved = std::max(resolved, rate * (decay * duration > life ? life / decay : duration));
+    resolved = std::max(
+        resolved, rate * (decay * duration > lifetime_time_constants ? lifetime_time_constants / decay : duration));
   }
-  return bound >= gain * resolved;
+  return bound >= min_gain * resolved;
 }
 
 }  // namespace ckc

@@ -1,14 +1,14 @@
-// Whether a motion is stiff, by the eigenvalues of its right-hand side.
+// Detection of stiffness from the eigenvalues of a Jacobian.
 #pragma once
 
 #include "tree/types.hpp"
 
 namespace ckc {
 
-// Whether an implicit method pays over a duration (s).
+// Whether an implicit method is worthwhile for a motion of this duration (s).
 //
-// A mode lambda has to be resolved while it lives, in steps of about 1 / |lambda|. It binds an explicit method to such
-// steps for the whole of the duration, an implicit one only until the mode is over.
-bool stiff(const Matrix& jacobian, double duration);
+// A mode lambda has to be resolved until it decays, with steps of about 1 / |lambda|. An explicit method needs such
+// steps for the whole duration, an implicit one only until the mode has decayed.
+bool is_stiff(const Matrix& jacobian, double duration);
 
 }  // namespace ckc

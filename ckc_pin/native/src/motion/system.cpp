@@ -5,91 +5,93 @@
 
 namespace ckc {
 
-constexpr double difference = 1.5e-8;  // step of forward differences, relative, or rad, m, and their rates
+constexpr double difference_step = 1.5e-8;  // step of forward differences: relative, or rad, m, and their rates
 
 System::System(Core& core_, Control& control_, int size_) : core(core_), control(control_), size(size_) {
-  velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.rows.closure.rows);
+  velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.constraints.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
-  acting_.setZero(core.n), uncorrected_.setZero(core.rows.closure.rows), drift_.setZero(core.n), back_.setZero(core.n);
+  applied_force_.setZero(core.n), zero_correction_.setZero(core.constraints.closure.rows),
+      locked_drift_.setZero(core.n), locked_correction_.setZero(core.n);
 }
 
-const Vector& System::acting(In v) {
-  if (!core.joints.acts()) return control.u_tree;
-  acting_ = control.u_tree;
-  core.joints.add_friction(v, acting_);
-  return acting_;
+const Vector& System::applied_force(In v) {
+  if (!core.joints.exerts_force()) return control.u_tree;
+  applied_force_ = control.u_tree;
+  core.joints.add_friction_force(v, applied_force_);
+  return applied_force_;
 }
 
-bool System::eq_1(In v, In correction, Out a) {
-  return core.eq_1(acting(v), correction, a) || fails(Trouble::rank);
+bool System::acceleration_with_held_joints(In v, In correction, Out a) {
+  return core.acceleration_with_held_joints(applied_force(v), correction, a) || fail(RhsFailure::rank_lost);
 }
 
-bool System::slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v) {
-  if (!control.acts() && !core.joints.smooth()) {  // nothing that answers to the state
-    force_ = control.u_tree;
-    return core.slopes(q_tree, v, correction, force_, none_, none_, a_, by_q, by_v) || fails(Trouble::rank);
+bool System::acceleration_derivatives(In q_tree, In v, In correction) {
+  if (!control.is_active() && !core.joints.has_smooth_friction()) {  // nothing depends on the state
+    force_.value = control.u_tree;
+    force_.by_q.resize(0, 0), force_.by_v.resize(0, 0);
+  } else if (!control.derivatives(core, force_.by_q, force_.by_v, force_.value)) {
+    return false;
   }
-  if (!control.slopes(core, u_by_q_, u_by_v_, force_)) return false;
-  return core.slopes(q_tree, v, correction, force_, u_by_q_, u_by_v_, a_, by_q, by_v) || fails(Trouble::rank);
+  return core.acceleration_derivatives(q_tree, v, correction, force_, eq_1_) || fail(RhsFailure::rank_lost);
 }
 
 bool System::acceleration(double t, Out a) {
   core.set_velocity(velocity);
-  return act(t) && eq_1(velocity, uncorrected_, a);
+  return compute_control(t) && acceleration_with_held_joints(velocity, zero_correction_, a);
 }
 
-bool System::keep_locked(Out y, double tolerance, bool& changed) {
+bool System::correct_locked_joints(Out y, double tolerance, bool& changed) {
   Joints& joints = core.joints;
   changed = false;
-  core.tree.to_coordinates(core.q_tree, drift_);
-  drift_ -= joints.place;
-  double off = 0.0, rate = 0.0;
+  core.tree.to_coordinates(core.q_tree, locked_drift_);
+  locked_drift_ -= joints.locked_at;
+  double max_drift = 0.0, max_rate = 0.0;
   for (int k : joints.locked) {
-    off = std::max(off, std::abs(drift_(k)) / joints.table.reach(k));
-    rate = std::max(rate, std::abs(velocity(k)) / joints.table.reach(k));
+    max_drift = std::max(max_drift, std::abs(locked_drift_(k)) / joints.table.reach(k));
+    max_rate = std::max(max_rate, std::abs(velocity(k)) / joints.table.reach(k));
   }
-  if (!(off > tolerance) && !(rate > tolerance)) return true;
-  if (!core.responses(joints.locked, responses_)) return false;
+  if (!(max_drift > tolerance) && !(max_rate > tolerance)) return true;
+  if (!core.unit_force_responses(joints.locked, responses_)) return false;
   changed = true;
-  joints.back(responses_, drift_, back_), shift(y, back_);
-  joints.back(responses_, velocity, back_), push(y, back_);
+  joints.compute_correction(responses_, locked_drift_, locked_correction_), add_displacement(y, locked_correction_);
+  joints.compute_correction(responses_, velocity, locked_correction_), add_velocity(y, locked_correction_);
   return y.allFinite();
 }
 
 double System::phi_z_margin() {
   if (!core.rank) return std::numeric_limits<double>::infinity();
-  if (!phi_z_) {
-    std::vector<Indices> pattern(core.rows.closure.rows);
+  if (!phi_z_singular_value_) {
+    std::vector<Indices> pattern(core.constraints.closure.rows);
     for (size_t i = 0; i < pattern.size(); ++i)
-      for (int j : core.rows.pattern[i])
+      for (int j : core.constraints.pattern[i])
         if (std::find(core.z.begin(), core.z.end(), j) != core.z.end()) pattern[i].push_back(j);
-    phi_z_ = std::make_unique<Spectrum>(std::move(pattern), core.n, core.rank);
+    phi_z_singular_value_ = std::make_unique<SmallestSingularValue>(std::move(pattern), core.n, core.rank);
   }
-  core.jacobian();
+  core.compute_J();
   const Vector &rows = core.scales.rows, &columns = core.scales.columns;
-  phi_z_->compute(core.rows.J, rows, columns);
+  phi_z_singular_value_->compute(core.constraints.J, rows, columns);
   double square = 0.0;
-  for (int i = 0; i < core.rows.closure.rows; ++i)
-    for (int j : core.rows.pattern[i]) {
-      const double scaled = rows(i) * core.rows.J(i, j) * columns(j);
+  for (int i = 0; i < core.constraints.closure.rows; ++i)
+    for (int j : core.constraints.pattern[i]) {
+      const double scaled = rows(i) * core.constraints.J(i, j) * columns(j);
       square += scaled * scaled;
     }
-  return phi_z_->least() / std::max(std::sqrt(square), 1e-300);
+  return phi_z_singular_value_->value() / std::max(std::sqrt(square), 1e-300);
 }
 
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const auto size = y.size();
-  jacobian.resize(size, size), rate_.resize(size), rate_here_.resize(size);
-  moved_ = y;
+  jacobian.resize(size, size), moved_rate_.resize(size), rate_at_y_.resize(size);
+  moved_y_ = y;
   ++evaluations, ++counts.differences;
-  if (!moves(t, moved_, rate_here_)) return false;
+  if (!motion_rhs(t, moved_y_, rate_at_y_)) return false;
   for (Eigen::Index k = 0; k < size; ++k) {
-    moved_(k) = y(k) + difference * std::max(1.0, std::abs(y(k)));
-    const double step = moved_(k) - y(k);
+    moved_y_(k) = y(k) + difference_step * std::max(1.0, std::abs(y(k)));
+    const double step = moved_y_(k) - y(k);
     ++evaluations;
-    if (!moves(t, moved_, rate_)) return false;
-    jacobian.col(k) = (rate_ - rate_here_) / step;
-    moved_(k) = y(k);
+    if (!motion_rhs(t, moved_y_, moved_rate_)) return false;
+    jacobian.col(k) = (moved_rate_ - rate_at_y_) / step;
+    moved_y_(k) = y(k);
   }
   return jacobian.allFinite();
 }

@@ -1,4 +1,4 @@
-// A formulation as a first-order system y' = f(t, y), as the step loop needs it.
+// A formulation of the equations of motion as a first-order system y' = f(t, y).
 #pragma once
 
 #include "control/control.hpp"
@@ -7,33 +7,33 @@
 
 namespace ckc {
 
-// Of |J|: phi_z's least singular value at which q has stopped to be a chart.
+// Smallest singular value of phi_z over |J| at which q is no longer a valid chart.
 constexpr double chart_margin = 1e-5;
 
 struct Counts {
   long newton = 0, factorizations = 0, switches = 0;
-  long differences = 0;  // Jacobians that were not exact
-  long pivoted = 0;      // right-hand sides for which the compiled elimination was not good enough
+  long differences = 0;  // Jacobians by finite differences
+  long general_rhs = 0;  // right-hand sides for which the compiled elimination was not accurate enough
 };
 
 // Why a right-hand side does not exist.
-enum class Trouble {
+enum class RhsFailure {
   none,
-  open,      // the loops could not be closed
-  rank,      // J has lost rank
-  infinite,  // a number is not finite
-  control,   // a controller has no u
-  vague,     // z is not known to the tolerance
-  shares,    // how motors at their limits share what they do not reach has no known derivative
-  pole,      // a motor goes from its limit to the other one at once: what is wanted of it passes through infinity
+  loops_open,  // the projection onto the constraint manifold failed
+  rank_lost,   // J has lost rank
+  not_finite,
+  no_control,                     // the controller has no u
+  z_inaccurate,                   // z does not agree with its rates within the tolerance
+  allocation_not_differentiable,  // the allocation among redundant motors at their limits has no known derivative
+  torque_pole,                    // a motor jumps from one limit to the other: its requested torque has a pole
 };
 
-// What becomes of an accepted state.
+// Result of accepting a state.
 enum class Accepted {
-  kept,
-  changed,    // y is another one now, on the same motion
-  restarted,  // y is in other coordinates: nothing that is remembered of former steps holds
-  refused,    // the coordinates end here
+  unchanged,
+  changed,    // y has changed but describes the same motion
+  restarted,  // y has new coordinates, so the history of steps is invalid
+  rejected,   // the coordinates are singular here
 };
 
 class System {
@@ -41,133 +41,143 @@ class System {
   System(Core& core, Control& control, int size);
   virtual ~System() = default;
 
-  // Begin at t from a configuration closed on phi = w, moving with v' (at rho q_dot, off the manifold too).
+  // Start at t from a configuration with phi = w and velocity v' (rho q_dot, also off the manifold).
   virtual void start(double t, In q_tree, In v_tree, In w, Out y) = 0;
-  // False where it does not exist or is not finite.
+  // Compute y'. False if it does not exist or is not finite.
   virtual bool rhs(double t, In y, Out y_dot) = 0;
-  // Of the motion alone, of its part of y.
-  virtual bool moves(double t, In y, Out y_dot) { return rhs(t, y, y_dot); }
-  // The core at the state, closed as well as the formulation closes it, with everything below; false where it fails.
-  virtual bool exact(double t, In y) = 0;
-  // The same, but with the loops as open as y has them, where they can be.
-  virtual bool as_is(double t, In y) { return exact(t, y); }
-  // What y itself has of a coordinate, or of its rate, but for how open the loops are; false where it has it not.
-  virtual bool shows(In, int, bool, double&) const { return false; }
-  // Write the core's state, which is exactly y's, into y: closed.
-  virtual void put_exact(Out) const {}
-  // `exact` where a motion goes on from.
-  virtual bool at_start(double t, In y) { return exact(t, y); }
-  // And for a state that `rhs` was evaluated at last, as closed as it is.
-  virtual bool at_last(double t, In y) = 0;
-  // The core with J where a state is, whatever its velocity; false where that is not known from the state alone.
-  virtual bool place(In) { return false; }
-  // How far q is from failing as coordinates, at the core's state: phi_z's least singular value over |J|, both free of
-  // units; infinite where no q is needed.
-  virtual double margin() { return std::numeric_limits<double>::infinity(); }
+  // y' of the motion alone, without auxiliary columns.
+  virtual bool motion_rhs(double t, In y, Out y_dot) { return rhs(t, y, y_dot); }
+  // Set the core and the members below to the state, projected as the formulation requires. False if that fails.
+  virtual bool sync_core(double t, In y) = 0;
+  // The same without projection, if possible.
+  virtual bool sync_core_unprojected(double t, In y) { return sync_core(t, y); }
+  // Read a coordinate (or its rate) from y, unprojected. False if y does not contain it.
+  virtual bool read_from_state(In, int, bool, double&) const { return false; }
+  // Write the projected state of the core, which belongs to y, into y.
+  virtual void write_projected_state(Out) const {}
+  // `sync_core` at the start of a motion.
+  virtual bool sync_core_at_start(double t, In y) { return sync_core(t, y); }
+  // `sync_core` at the state of the last right-hand side, without a new projection.
+  virtual bool sync_core_at_last_rhs(double t, In y) = 0;
+  // Set the core to the configuration of y and compute J. False if that needs more than y.
+  virtual bool set_core_configuration(In) { return false; }
+  // Distance of q from being a singular chart, at the core's state: smallest singular value of phi_z over |J|,
+  // dimensionless. Infinite if the formulation needs no q.
+  virtual double coordinate_margin() { return std::numeric_limits<double>::infinity(); }
   double phi_z_margin();
-  virtual Accepted accept(double t, Out y, double margin) = 0;
-  // Make the user's own partition that of q; false where phi_z is singular there.
-  virtual bool own_partition(double, Out, bool& changed) { return changed = false, true; }
-  // d rhs / d y of the motion, here by differences, counted in `evaluations`; false where one does not exist.
+  virtual Accepted accept_step(double t, Out y, double margin) = 0;
+  // Return to the user's partition. False if its phi_z is singular.
+  virtual bool restore_partition(double, Out, bool& changed) { return changed = false, true; }
+  // d rhs / d y of the motion. The default uses finite differences, counted in `evaluations`. False if one does not
+  // exist.
   virtual bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
-  // Its entries of y whose rate is another entry: (where, which).
-  virtual void rates(std::vector<std::pair<int, int>>& of) const = 0;
-  // And by itself of each column that y has beside the motion, where `jacobian` was asked for last; null where it has none.
-  virtual const Matrix* beside_jacobian() const { return nullptr; }
-  virtual void beside_rates(std::vector<std::pair<int, int>>&) const {}
-  // Time in which the motion may change, known from the start, s: that of a boundary layer.
-  virtual double layer() const { return std::numeric_limits<double>::infinity(); }
-  // Whether the motion keeps its energy where nothing acts and nothing dampens.
-  virtual bool conserves() const { return false; }
-  // Rate of phi over phi on a level set: what phi_dot should be.
-  virtual double decay() const { return 0.0; }
-  // The part of a Jacobian at y whose eigenvalues tell how the freedoms move; false where there is none.
-  virtual bool modes(In, Matrix&) { return true; }
-  // Acceleration of the tree at the state that `rhs` was evaluated at last; false where it is not known.
+  // Pairs (i, j) of entries of y where the rate of y(i) is y(j).
+  virtual void rate_pairs(std::vector<std::pair<int, int>>& of) const = 0;
+  // The Jacobian of each auxiliary column with respect to itself, at the state of the last `jacobian`; null if there
+  // are none.
+  virtual const Matrix* auxiliary_jacobian() const { return nullptr; }
+  virtual void auxiliary_rate_pairs(std::vector<std::pair<int, int>>&) const {}
+  // Duration of a boundary layer at the start of the motion, s.
+  virtual double boundary_layer_time() const { return std::numeric_limits<double>::infinity(); }
+  // Whether the motion conserves its energy without control, friction and damping.
+  virtual bool conserves_energy() const { return false; }
+  // w_dot / w on a level set.
+  virtual double w_decay_rate() const { return 0.0; }
+  // Reduce a Jacobian at y to the part whose eigenvalues belong to the freedoms. False if that fails.
+  virtual bool reduce_to_freedoms(In, Matrix&) { return true; }
+  // `rhs` at y projected onto the constraint manifold to rounding, along all directions that J determines, however
+  // weakly. False if the formulation cannot cross singular positions.
+  virtual bool rate_on_manifold(double, In, Out) { return false; }
+  // Acceleration of the tree at the last right-hand side. False if unknown.
   virtual bool tree_acceleration(In f, Out a) const = 0;
-  // A step was refused because y does not tell the rest of the motion as its rates do: forget what was found since the
-  // last accepted state, and be more exact from there; false where that has not helped.
+  // Called after a step was rejected because the full motion disagrees with its rates: forget all states since the
+  // last accepted one, and project more exactly from there. False if that does not help any more.
   virtual bool return_to_accepted() { return true; }
-  // How many numbers the whole motion (q', v') is where y is only a part that determines it, else zero.
-  virtual int whole_size() const { return 0; }
-  // How many numbers of y, its last ones, are no part of the motion.
-  virtual int beside() const { return 0; }
-  // The longest step over which its rates add up to anything, s.
-  virtual double whole_within() const { return std::numeric_limits<double>::infinity(); }
-  // The whole motion and its rate at the state that `rhs` was evaluated at last, f = rhs(t, y).
-  virtual void whole(In, Out, Out) const {}
-  // Add to what may be wrong in each of its numbers x what rounding alone makes wrong.
+  // Size of the full motion (q', v') if y is only a part that determines it, else zero.
+  virtual int full_motion_size() const { return 0; }
+  // Number of trailing entries of y that do not belong to the motion.
+  virtual int auxiliary_size() const { return 0; }
+  // Longest step over which the full motion's rates can be integrated, s.
+  virtual double full_motion_max_step() const { return std::numeric_limits<double>::infinity(); }
+  // The full motion and its rate at the last right-hand side, f = rhs(t, y).
+  virtual void full_motion(In, Out, Out) const {}
+  // Add the rounding errors of the full motion x to its error tolerances.
   virtual void add_rounding(In, Out) const {}
 
   // --- dry friction and stops ---
-  // What acts on the tree where its motion is v: the controller's forces, and friction of what slides.
-  const Vector& acting(In v);
-  // Acceleration of the tree at the core's state, which is exact, with what holds the joints that stick or touch.
+  //
+  // Forces on the tree at velocity v: of the controller, and friction of sliding joints.
+  const Vector& applied_force(In v);
+  // Acceleration of the tree at the core's state, with holding forces on locked joints.
   bool acceleration(double t, Out a);
-  // Take back what locked joints have drifted by more than `tolerance`, and their rates, at the core's state, that of y;
-  // false where that cannot be.
-  bool keep_locked(Out y, double tolerance, bool& changed);
-  // --- parameters (sensitivity/sensitivity_system.hpp) ---
-  // Of a coordinate, or of its rate: it comes to what it is; to a stop, -1 for the lower one, that moves with parameters.
-  struct Met { int coordinate; bool of_rate; int stop = 0; };
-  // Where joints change what they do, at y where the core is: what comes there at a time of its own; a round of an
-  // impact, that adds `step` to the velocities by impulses `x` on the coordinates `at`, with a restitution; and what has
-  // come to be as it is at that time, to a tolerance. False where that time is not one for all of them.
-  virtual bool before_change(double, In, const std::vector<Met>&) { return true; }
+  // Remove the drift of locked joints beyond `tolerance`, and their rates, from y, which is the core's state. False
+  // if that fails.
+  bool correct_locked_joints(Out y, double tolerance, bool& changed);
+  // --- sensitivities (sensitivity/sensitivity_system.hpp) ---
+  //
+  // A coordinate, or its rate, that arrives at a value where joint modes change. `stop`: at a stop, -1 for the lower
+  // one; its position may depend on parameters.
+  struct JointArrival {
+    int coordinate;
+    bool of_rate;
+    int stop = 0;
+  };
+  // Called at a transition of joint modes, at y, where the core is: before it, with the arrivals; in each round of an
+  // impact, which adds `step` to the velocities by impulses `x` on the coordinates `at`; and after it. False if the
+  // motion is not differentiable.
+  virtual bool before_transition(double, In, const std::vector<JointArrival>&) { return true; }
   virtual bool at_impact(In, const Indices&, const Matrix&, In, double) { return true; }
-  virtual bool after_change(double, Out, const std::vector<Met>&, double, double) { return true; }
-  // At the end of an accepted step with locked joints: whether they stay locked with parameters on both sides of theirs.
+  virtual bool after_transition(double, Out, const std::vector<JointArrival>&, double, double) { return true; }
+  // At the end of an accepted step: whether locked joints stay locked for neighbouring parameter values.
   virtual bool stays_locked(double) { return true; }
-  // A controller has looked at y, where the core is, or what it found has come to act; false where that is not known.
-  // Whether from here on rates of y are others.
-  virtual bool sampled(In, bool&) { return true; }
-  // Numbers that are recorded behind those of the state.
-  virtual int extra() const { return 0; }
-  virtual void put_extra(In, Out) {}  // at the core's state, that of y, with what acts there
+  // After a sample at y, where the core is, or after a delayed output was applied. `changed`: whether integration has
+  // to restart. False if a derivative is unknown.
+  virtual bool control_sampled(In, bool&) { return true; }
+  // Number of additional columns of the record.
+  virtual int extra_columns() const { return 0; }
+  virtual void write_extra_columns(In, Out) {}  // the core is at y, with its control evaluated
 
   // Add to the velocities, and to the coordinates, in y.
-  virtual void push(Out y, In v) const = 0;
-  virtual void shift(Out y, In step) const = 0;
-  // The motion goes on from y, where the core is, with another velocity: what is remembered of former states is no more.
-  virtual void go_on(double, Out) {}
+  virtual void add_velocity(Out y, In v) const = 0;
+  virtual void add_displacement(Out y, In step) const = 0;
+  // Continue from y, where the core is, with another velocity. The history of states is invalid.
+  virtual void resume(double, Out) {}
 
   Core& core;
   Control& control;
-  int size;               // of y
+  int size;  // of y
   Counts counts;
   EliminationCheck elimination;
-  bool crosses = false;     // positions where J loses rank are passed
-  bool may_switch = false;  // q may become other coordinates
-  Vector velocity;          // of the tree, (n)
-  Vector v_tree;            // what C takes its velocity from, (n)
-  Vector w;                 // what phi should be, (rows)
-  Vector q, q_dot;          // (d)
+  bool crosses_singularities = false;  // singular positions are crossed
+  bool may_change_partition = false;   // q may change
+  Vector velocity;                     // (n)
+  Vector v_tree;                       // velocity that C uses, (n)
+  Vector w;                            // prescribed value of phi, (rows)
+  Vector q, q_dot;                     // (d)
 
-  Trouble trouble = Trouble::none;  // of the last right-hand side that did not exist
+  RhsFailure failure = RhsFailure::none;  // of the last right-hand side
 
-  // Everything that acts at the core's state; false where a controller has no u.
-  bool act(double t) { return control.act(measured(t)) || fails(Trouble::control); }
-  Measured measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
+  // Evaluate the control at the core's state. False if the controller has no u.
+  bool compute_control(double t) { return control.compute(measured(t)) || fail(RhsFailure::no_control); }
+  MeasuredState measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
 
  protected:
-  bool fails(Trouble why) { return trouble = why, false; }
-  void new_partition() { phi_z_.reset(); }  // of the core
-  // Eq. 1 at the core's state moving with v, what acts there known, with what holds joints; `correction`: of J a.
-  bool eq_1(In v, In correction, Out a);
-  // d a / d q' and d v' of eq. 1 with that correction, tangent, where what acts at (q', v') is known; the core is there
-  // unless its terms are written out and no joint is held. False where what acts has no known derivatives.
-  bool slopes(In q_tree, In v, In correction, Matrix& by_q, Matrix& by_v);
+  bool fail(RhsFailure reason) { return failure = reason, false; }
+  void partition_changed() { phi_z_singular_value_.reset(); }  // of the core
+  // Eq. 1 at the core's state with velocity v, including holding forces. `correction` is added to J_dot v.
+  bool acceleration_with_held_joints(In v, In correction, Out a);
+  // Compute eq_1_, the derivatives of that acceleration. The core must be at this state, unless
+  // terms are compiled and no joint is locked. False if the applied force has no known derivatives.
+  bool acceleration_derivatives(In q_tree, In v, In correction);
 
-  Vector uncorrected_;  // zero, (rows)
-  Matrix by_q_, by_v_;  // eq. 1's, where `jacobian` was asked for last and found without differences
+  Vector zero_correction_;        // zero, (rows)
+  AccelerationDerivatives eq_1_;  // at the last `jacobian` if that needed no differences; without by_u
 
  private:
-  std::unique_ptr<Spectrum> phi_z_;
-  Vector moved_, rate_, rate_here_, acting_, drift_, back_, force_;
-  Matrix u_by_q_, u_by_v_, none_;
+  std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
+  Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_;
+  AppliedForce force_;
 
- protected:
-  Vector a_;
   Matrix responses_;
 };
 

@@ -6,7 +6,7 @@ namespace ckc {
 
 namespace {
 
-// Of two spatial motions.
+// Cross product of two spatial motions, (linear, angular).
 Vector6 cross(const Vector6& a, const Vector6& b) {
   const Vector3 a_turn = a.tail<3>(), b_turn = b.tail<3>(), a_move = a.head<3>(), b_move = b.head<3>();
   Vector6 c;
@@ -16,41 +16,45 @@ Vector6 cross(const Vector6& a, const Vector6& b) {
 
 }  // namespace
 
-// The axes S of all coordinates at or below one turn with it, S x S', and nothing above moves.
-void changes_of(const Tree& tree, int joint, Sway& found) {
+// Differentiating along a coordinate rotates the axes S of all coordinates at or below it by S x S'. The motion of
+// bodies above the coordinate does not depend on it.
+void compute_motion_derivatives(const Tree& tree, int joint, JointMotionDerivatives& motion) {
   const Indices& support = tree.support[joint];
   const auto count = static_cast<Eigen::Index>(support.size());
-  for (Matrix6x* x : {&found.place, &found.velocity, &found.rate, &found.rate_by_v}) x->resize(6, count);
-  const Vector6 v = tree.motion(joint), a = tree.motion_rate(joint);
+  for (Matrix6x* x : {&motion.axis, &motion.velocity_by_q, &motion.acceleration_by_q, &motion.acceleration_by_v})
+    x->resize(6, count);
+  const Vector6 v = tree.velocity(joint), a = tree.acceleration(joint);
   for (Eigen::Index k = 0; k < count; ++k) {
     const int of = tree.joint_of[support[k]], above = tree.parent[of];
-    const Vector6 axis = tree.jacobian().col(support[k]), v_above = tree.motion(above), relative = v - v_above;
-    found.place.col(k) = axis;
-    found.velocity.col(k) = cross(axis, relative);
-    found.rate.col(k) = cross(axis, a - tree.motion_rate(above)) + cross(cross(v_above, axis), relative);
-    found.rate_by_v.col(k) = cross(tree.motion(of), axis) + cross(axis, relative);
+    const Vector6 axis = tree.jacobian().col(support[k]), v_above = tree.velocity(above), relative = v - v_above;
+    motion.axis.col(k) = axis;
+    motion.velocity_by_q.col(k) = cross(axis, relative);
+    motion.acceleration_by_q.col(k) = cross(axis, a - tree.acceleration(above)) + cross(cross(v_above, axis), relative);
+    motion.acceleration_by_v.col(k) = cross(tree.velocity(of), axis) + cross(axis, relative);
   }
 }
 
-void Carried::set(const Tree& tree, int of, const Vector3& local, bool is_point, const Sway& changes) {
+void AttachedVector::set(const Tree& tree, int of, const Vector3& local, bool is_point,
+                         const JointMotionDerivatives& motion) {
   joint = of;
-  const double moves = is_point ? 1.0 : 0.0;
-  const Vector6 v = tree.motion(joint), a = tree.motion_rate(joint);
-  const Vector3 turn = v.tail<3>(), turn_dot = a.tail<3>();
-  x = tree.rotation(joint) * local + moves * tree.translation(joint);
-  x_dot = moves * v.head<3>() + turn.cross(x);
-  x_ddot = moves * a.head<3>() + turn_dot.cross(x) + turn.cross(x_dot);
-  const auto count = changes.place.cols();
+  const double translates = is_point ? 1.0 : 0.0;
+  const Vector6 v = tree.velocity(joint), a = tree.acceleration(joint);
+  const Vector3 omega = v.tail<3>(), omega_dot = a.tail<3>();
+  x = tree.rotation(joint) * local + translates * tree.translation(joint);
+  x_dot = translates * v.head<3>() + omega.cross(x);
+  x_ddot = translates * a.head<3>() + omega_dot.cross(x) + omega.cross(x_dot);
+  const auto count = motion.axis.cols();
   for (Columns* columns : {&by_q, &dot_by_q, &ddot_by_q, &ddot_by_v}) columns->resize(3, count);
   for (Eigen::Index k = 0; k < count; ++k) {
     const auto part = [&](const Matrix6x& of, int at) { return Vector3(of.col(k).segment<3>(at)); };
-    const Vector3 by = moves * part(changes.place, 0) + part(changes.place, 3).cross(x);
-    const Vector3 dot_by = moves * part(changes.velocity, 0) + part(changes.velocity, 3).cross(x) + turn.cross(by);
+    const Vector3 by = translates * part(motion.axis, 0) + part(motion.axis, 3).cross(x);
+    const Vector3 dot_by =
+        translates * part(motion.velocity_by_q, 0) + part(motion.velocity_by_q, 3).cross(x) + omega.cross(by);
     by_q.col(k) = by, dot_by_q.col(k) = dot_by;
-    ddot_by_q.col(k) = moves * part(changes.rate, 0) + part(changes.rate, 3).cross(x) + turn_dot.cross(by) +
-                       part(changes.velocity, 3).cross(x_dot) + turn.cross(dot_by);
-    ddot_by_v.col(k) = moves * part(changes.rate_by_v, 0) + part(changes.rate_by_v, 3).cross(x) +
-                       part(changes.place, 3).cross(x_dot) + turn.cross(by);
+    ddot_by_q.col(k) = translates * part(motion.acceleration_by_q, 0) + part(motion.acceleration_by_q, 3).cross(x) +
+                       omega_dot.cross(by) + part(motion.velocity_by_q, 3).cross(x_dot) + omega.cross(dot_by);
+    ddot_by_v.col(k) = translates * part(motion.acceleration_by_v, 0) + part(motion.acceleration_by_v, 3).cross(x) +
+                       part(motion.axis, 3).cross(x_dot) + omega.cross(by);
   }
 }
 

@@ -1,28 +1,29 @@
-// Points and directions that joints carry, and how they and their rates change along coordinates and with velocities.
+// Derivatives of the motion of joints, and of points and directions attached to them, with respect to q' and v'.
 #pragma once
 
 #include "tree/tree.hpp"
 
 namespace ckc {
 
-// How the motion of a joint changes along each coordinate of its support, and with each velocity; world axes.
-struct Sway {
-  Matrix6x place, velocity, rate;    // twists: along a coordinate
-  Matrix6x rate_by_v;                // with a velocity; of the velocity that is `place`
+// Derivatives of a joint's spatial motion with respect to the coordinates and velocities of its support, one column
+// each, in world axes. The derivative of the velocity with respect to v' is `axis`.
+struct JointMotionDerivatives {
+  Matrix6x axis, velocity_by_q, acceleration_by_q;  // with respect to q'
+  Matrix6x acceleration_by_v;                       // with respect to v'
 };
 
-// After `Tree::derivatives`, overwriting what was found before.
-void changes_of(const Tree& tree, int joint, Sway& found);
+// Requires `Tree::compute_derivatives` at the state; overwrites `motion`.
+void compute_motion_derivatives(const Tree& tree, int joint, JointMotionDerivatives& motion);
 
-struct Carried {
+struct AttachedVector {
   using Columns = Eigen::Matrix<double, 3, Eigen::Dynamic>;
 
-  // A point where `is_point`, else a direction, given in the joint's axes.
-  void set(const Tree& tree, int of, const Vector3& local, bool is_point, const Sway& changes);
+  // Evaluate a point (`is_point`) or a direction, given in the joint's own axes.
+  void set(const Tree& tree, int of, const Vector3& local, bool is_point, const JointMotionDerivatives& motion);
 
   int joint = 0;
   Vector3 x, x_dot, x_ddot;
-  Columns by_q;         // a column a coordinate of the support; of x_dot by velocities too
+  Columns by_q;  // (3, support); also the derivative of x_dot with respect to v'
   Columns dot_by_q, ddot_by_q, ddot_by_v;
 };
 

@@ -8,27 +8,28 @@
 
 namespace ckc {
 
-constexpr int few = 6;  // rows, which to take as they are costs less than to look where their entries are
+// Smaller matrices are factorized densely: searching for the nonzero entries would cost more.
+constexpr int max_dense_rows = 6;
 
 void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
-  rows_ = rows, columns_ = columns, pattern_ = pattern, small_ = rows == columns && rows <= few;
+  rows_ = rows, columns_ = columns, pattern_ = pattern, small_ = rows == columns && rows <= max_dense_rows;
   Indices first(columns, rows);
   for (int i = rows - 1; i >= 0; --i)
     for (int j : pattern[i]) first[j] = i;
-  column_at_.resize(columns), place_of_.resize(columns);
+  column_at_.resize(columns), position_of_.resize(columns);
   std::iota(column_at_.begin(), column_at_.end(), 0);
   std::stable_sort(column_at_.begin(), column_at_.end(), [&](int a, int b) { return first[a] < first[b]; });
-  for (int k = 0; k < columns; ++k) place_of_[column_at_[k]] = k;
+  for (int k = 0; k < columns; ++k) position_of_[column_at_[k]] = k;
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
     lu_.setZero(rows, columns);
-    high_.assign(rows, 0), row_at_.resize(rows), below_.resize(rows), beginning_.assign(rows, {});
-    for (auto& touched : below_) touched.reserve(rows);
-    active_.reserve(rows);
+    row_end_.assign(rows, 0), row_at_.resize(rows), eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
+    for (auto& eliminated : eliminated_rows_) eliminated.reserve(rows);
+    active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
       int low = rows;
-      for (int j : pattern[i]) low = std::min(low, place_of_[j]);
-      if (low < rows) beginning_[low].push_back(i);
+      for (int j : pattern[i]) low = std::min(low, position_of_[j]);
+      if (low < rows) rows_starting_at_[low].push_back(i);
     }
   } else {
     qr_.setZero(rows, columns);
@@ -49,29 +50,30 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
     return eliminate_small();
   }
   for (int i = 0; i < rows_; ++i) {
-    lu_.row(i).head(high_[i]).setZero();  // what the last time left
-    high_[i] = 0;
+    lu_.row(i).head(row_end_[i]).setZero();  // clear the fill-in of the previous factorization
+    row_end_[i] = 0;
     for (int j : pattern_[i]) {
-      const int k = place_of_[j];
+      const int k = position_of_[j];
       lu_(i, k) = a(i, at(j));
-      high_[i] = std::max(high_[i], k + 1);
+      row_end_[i] = std::max(row_end_[i], k + 1);
     }
   }
   eliminate();
 }
 
-void Definite::shape(int size) {
-  few_ = size <= few;
-  if (few_)
+void DefiniteFactor::shape(int size) {
+  is_small_ = size <= max_dense_rows;
+  if (is_small_)
     small_.shape(size, size, full_pattern(size));
   else
-    large_.compute(Matrix::Identity(size, size));  // used once, before anything can move it
+    // A solver that has computed nothing cannot be moved, so use it once.
+    large_.compute(Matrix::Identity(size, size));
 }
 
-void Definite::compute(const Matrix& a) { few_ ? small_.compute(a) : void(large_.compute(a)); }
+void DefiniteFactor::compute(const Matrix& a) { is_small_ ? small_.compute(a) : void(large_.compute(a)); }
 
-void Definite::solve(In b, Out x) {
-  if (few_) return small_.solve(b, x);
+void DefiniteFactor::solve(In b, Out x) {
+  if (is_small_) return small_.solve(b, x);
   x = b;
   large_.matrixL().solveInPlace(x);
   large_.matrixU().solveInPlace(x);
@@ -84,32 +86,32 @@ std::vector<Indices> full_pattern(int size) {
 }
 
 void Factor::eliminate() {
-  active_.clear();
+  active_rows_.clear();
   for (int k = 0; k < rows_; ++k) {
-    active_.insert(active_.end(), beginning_[k].begin(), beginning_[k].end());
+    active_rows_.insert(active_rows_.end(), rows_starting_at_[k].begin(), rows_starting_at_[k].end());
     size_t best = 0;
     double largest = -1.0;
-    for (size_t i = 0; i < active_.size(); ++i) {
-      const double size = std::abs(lu_(active_[i], k));
+    for (size_t i = 0; i < active_rows_.size(); ++i) {
+      const double size = std::abs(lu_(active_rows_[i], k));
       if (size > largest || std::isnan(size)) largest = size, best = i;
     }
     if (!(largest > 0.0)) singular_ = true;
-    below_[k].clear();
-    if (active_.empty()) {  // by its pattern alone
+    eliminated_rows_[k].clear();
+    if (active_rows_.empty()) {  // structurally singular
       row_at_[k] = k;
       continue;
     }
-    const int pivot = active_[best], end = high_[pivot];
-    active_.erase(active_.begin() + static_cast<std::ptrdiff_t>(best));
+    const int pivot = active_rows_[best], end = row_end_[pivot];
+    active_rows_.erase(active_rows_.begin() + static_cast<std::ptrdiff_t>(best));
     row_at_[k] = pivot;
     const double diagonal = lu_(pivot, k);
-    for (int row : active_) {
+    for (int row : active_rows_) {
       if (lu_(row, k) == 0.0) continue;
       const double factor = lu_(row, k) / diagonal;
       lu_(row, k) = factor;
       for (int j = k + 1; j < end; ++j) lu_(row, j) -= factor * lu_(pivot, j);
-      high_[row] = std::max(high_[row], end);
-      below_[k].push_back(row);
+      row_end_[row] = std::max(row_end_[row], end);
+      eliminated_rows_[k].push_back(row);
     }
   }
 }
@@ -159,9 +161,9 @@ void Factor::householder() {
     for (int j = k + 1; j < columns_; ++j) {
       auto y = qr_.col(j).tail(rows_ - k);
       const auto v = x.tail(rows_ - k - 1);
-      const double along = tau_(k) * (y(0) + v.dot(y.tail(rows_ - k - 1)));
-      y(0) -= along;
-      y.tail(rows_ - k - 1) -= along * v;
+      const double projection = tau_(k) * (y(0) + v.dot(y.tail(rows_ - k - 1)));
+      y(0) -= projection;
+      y.tail(rows_ - k - 1) -= projection * v;
     }
   }
 }
@@ -171,13 +173,13 @@ void Factor::solve(In b, Out x) {
     work_.head(rows_) = b;
     for (int k = 0; k < columns_; ++k) {
       const auto v = qr_.col(k).tail(rows_ - k - 1);
-      const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
-      work_(k) -= along;
-      work_.segment(k + 1, rows_ - k - 1) -= along * v;
+      const double projection = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+      work_(k) -= projection;
+      work_.segment(k + 1, rows_ - k - 1) -= projection * v;
     }
     for (int k = columns_ - 1; k >= 0; --k) {
-      const int rest = columns_ - k - 1;
-      work_(k) = (work_(k) - qr_.row(k).tail(rest).dot(work_.segment(k + 1, rest))) / qr_(k, k);
+      const int remaining = columns_ - k - 1;
+      work_(k) = (work_(k) - qr_.row(k).tail(remaining).dot(work_.segment(k + 1, remaining))) / qr_(k, k);
     }
     x = work_.head(columns_);
     return;
@@ -200,25 +202,24 @@ void Factor::solve(In b, Out x) {
   work_.head(rows_) = b;
   for (int k = 0; k < rows_; ++k) {
     const double value = work_(row_at_[k]);
-    for (int row : below_[k]) work_(row) -= lu_(row, k) * value;
+    for (int row : eliminated_rows_[k]) work_(row) -= lu_(row, k) * value;
   }
   for (int k = rows_ - 1; k >= 0; --k) {
     const int row = row_at_[k];
     double value = work_(row);
-    for (int j = k + 1; j < high_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
+    for (int j = k + 1; j < row_end_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
     x(column_at_[k]) = value / lu_(row, k);
   }
 }
 
 void Factor::solve_transposed(In b, Out x) {
   work_.setZero();
-  for (int k = 0; k < columns_; ++k)
-    work_(k) = (b(k) - qr_.col(k).head(k).dot(work_.head(k))) / qr_(k, k);
+  for (int k = 0; k < columns_; ++k) work_(k) = (b(k) - qr_.col(k).head(k).dot(work_.head(k))) / qr_(k, k);
   for (int k = columns_ - 1; k >= 0; --k) {
     const auto v = qr_.col(k).tail(rows_ - k - 1);
-    const double along = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
-    work_(k) -= along;
-    work_.segment(k + 1, rows_ - k - 1) -= along * v;
+    const double projection = tau_(k) * (work_(k) + v.dot(work_.segment(k + 1, rows_ - k - 1)));
+    work_(k) -= projection;
+    work_.segment(k + 1, rows_ - k - 1) -= projection * v;
   }
   x = work_.head(rows_);
 }

@@ -1,4 +1,4 @@
-// Factorizations without allocation after the first use.
+// Matrix factorizations that allocate nothing after their first use.
 #pragma once
 
 #include <Eigen/Cholesky>
@@ -7,21 +7,21 @@
 
 namespace ckc {
 
-// LU with row pivoting of a square matrix, QR of a tall one, with solves by either.
+// LU factorization with row pivoting of a square matrix, or QR factorization of a tall one, with solves.
 //
-// The rows of a closure that hold one loop meet few columns. Each row keeps the interval of its entries that are not
-// zero, and elimination works on the intervals: with the columns in the order in which the rows meet them, loops
-// that are independent cost what each costs alone, and a chain of loops what a band costs.
+// The constraint rows of one loop involve few columns. Each row therefore stores the interval of its nonzero entries,
+// and elimination works on these intervals. Columns are sorted by the first row that involves them. Independent loops
+// then cost as much as each one alone, and a chain of loops costs as much as a banded matrix.
 class Factor {
  public:
-  // Columns in the order of the first row that meets them, by the pattern of a (rows, columns) matrix.
+  // Set the sparsity pattern of a (rows, columns) matrix. Columns are sorted by the first row that involves them.
   void shape(int rows, int columns, const std::vector<Indices>& pattern);
-  // Of columns of a matrix (all when none are named); entries outside the pattern are zero.
+  // Factorize the given columns of a matrix (all if `columns` is empty). Entries outside the pattern must be zero.
   void compute(const Matrix& a, const Indices& columns = {});
-  void solve(In b, Out x);            // least squares when tall
-  void solve_transposed(In b, Out x); // A^T x = b, of minimum norm; of a tall matrix only
+  void solve(In b, Out x);             // least squares if the matrix is tall
+  void solve_transposed(In b, Out x);  // minimum-norm solution of A^T x = b; tall matrices only
   bool singular() const { return singular_; }
-  double pivot_ratio() const;         // the smallest pivot to the largest
+  double pivot_ratio() const;  // smallest pivot divided by the largest
 
  private:
   void eliminate();
@@ -30,20 +30,20 @@ class Factor {
 
   int rows_ = 0, columns_ = 0;
   std::vector<Indices> pattern_;
-  Indices column_at_;                 // column_at_[k]: which column of the matrix is the k-th here
-  Indices place_of_;                  // its inverse
+  Indices column_at_;    // column_at_[k]: column of the matrix that is eliminated k-th
+  Indices position_of_;  // inverse of column_at_
   Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
   Matrix qr_;
   Vector tau_, work_;
-  Indices high_, row_at_;             // ends of the intervals, and where pivoting put the rows
-  std::vector<Indices> beginning_;    // by column: rows whose interval begins there
-  std::vector<Indices> below_;        // by column: rows that its elimination touched
-  Indices active_;                    // rows met and not yet pivots
+  Indices row_end_, row_at_;               // ends of the intervals; rows in pivot order
+  std::vector<Indices> rows_starting_at_;  // by column: rows whose interval begins there
+  std::vector<Indices> eliminated_rows_;   // by column: rows that its elimination changed
+  Indices active_rows_;                    // rows that have started and are not yet pivots
   bool small_ = false, singular_ = false;
 };
 
-// Cholesky's factorization of a symmetric positive definite matrix; a small one is eliminated as it is.
-class Definite {
+// Cholesky factorization of a symmetric positive definite matrix. Small matrices use LU instead, which is faster.
+class DefiniteFactor {
  public:
   void shape(int size);
   void compute(const Matrix& a);
@@ -52,10 +52,10 @@ class Definite {
  private:
   Factor small_;
   Eigen::LLT<Matrix> large_;
-  bool few_ = true;
+  bool is_small_ = true;
 };
 
-// The pattern of a full square matrix.
+// Sparsity pattern of a dense square matrix.
 std::vector<Indices> full_pattern(int size);
 
 }  // namespace ckc

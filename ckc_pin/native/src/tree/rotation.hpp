@@ -1,4 +1,4 @@
-// Rotation vectors: by which matrix they move, and how that matrix changes.
+// The Jacobian of the rotation vector (logarithm of SO(3)) and its derivatives.
 #pragma once
 
 #include "tree/types.hpp"
@@ -11,18 +11,18 @@ inline Matrix3 skew(const Vector3& a) {
   return m;
 }
 
-// u_dot = Jlog(u) omega, omega in the turned axes: Jlog(u) = 1 + [u]/2 + c(|u|) [u]^2.
-class LogRate {
+// Jlog(u) with u_dot = Jlog(u) omega, where omega is in the rotated axes: Jlog(u) = 1 + [u]/2 + c(|u|) [u]^2.
+class LogJacobian {
  public:
-  explicit LogRate(const Vector3& u);
+  explicit LogJacobian(const Vector3& u);
   Matrix3 value;
-  Matrix3 along(const Vector3& a) const;                    // its derivative along a
-  Matrix3 along(const Vector3& a, const Vector3& b) const;  // and of that along b
+  Matrix3 derivative(const Vector3& a) const;                           // directional derivative along a
+  Matrix3 second_derivative(const Vector3& a, const Vector3& b) const;  // along a, then b
 
  private:
   Vector3 u_;
   Matrix3 s_;
-  double c_, c_rate_, c_curve_;  // c, then each divided derivative: c'(x)/x, and of that once more
+  double c_, c_rate_, c_second_;  // c(x), c'(x)/x, and the same operation applied to that
 };
 
 }  // namespace ckc

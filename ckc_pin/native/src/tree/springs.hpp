@@ -1,4 +1,4 @@
-// Springs and dampers between frames or on joints, constant forces.
+// Springs and dampers between frames or on joints, and constant joint forces.
 #pragma once
 
 #include "tree/tree.hpp"
@@ -8,7 +8,7 @@ namespace ckc {
 struct SpringTable {
   Indices point_joint;  // the ends A of all springs between frames, then the ends B
   std::vector<Vector3> point_local;
-  Vector stiffness, rest_length, damping;  // (springs)
+  Vector stiffness, rest_length, damping;                       // (springs)
   Vector joint_stiffness, joint_rest, joint_damping, constant;  // (n)
 };
 
@@ -16,25 +16,25 @@ class Springs {
  public:
   Springs(const Tree& tree, SpringTable table);
 
-  SpringTable table;  // changed by `vary` alone
-  bool any, any_damping;
+  SpringTable table;  // modified by `set_parameters` only
+  bool has_elastic_forces, has_damping;
   Eigen::Index count() const { return count_; }
 
-  enum class Number { end, stiffness, rest_length, damping, joint_stiffness, joint_rest, joint_damping, constant };
-  void vary(Number what, In numbers);
+  enum class Parameter { end, stiffness, rest_length, damping, joint_stiffness, joint_rest, joint_damping, constant };
+  void set_parameters(Parameter what, In numbers);
 
-  void set(const Tree& tree);  // lengths, from the tree's placements and Jacobian
-  void add_elastic(const Tree& tree, In q, Out force) const;
-  void add_damping(In v, Out force) const;
+  void update_lengths(const Tree& tree);  // requires the tree's placements and Jacobian
+  void add_elastic_force(const Tree& tree, In q, Out force) const;
+  void add_damping_force(In v, Out force) const;
   double energy(const Tree& tree, In q) const;
 
  private:
-  void look();  // which of them there are
+  void update_flags();  // has_elastic_forces, has_damping
 
   int count_;
   std::vector<Indices> pattern_;
   Vector length_;
-  Matrix jacobian_;  // of the lengths, (springs, n)
+  Matrix jacobian_;  // Jacobian of the lengths, (springs, n)
 };
 
 }  // namespace ckc

@@ -21,7 +21,7 @@ namespace pin = pinocchio;
 struct Tree::Workspace {
   pin::Model model;
   pin::Data data;
-  explicit Workspace(pin::Model&& given) : model(std::move(given)), data(model) {}
+  explicit Workspace(pin::Model&& loaded) : model(std::move(loaded)), data(model) {}
 };
 
 static pin::Model read(const std::string& serialized) {
@@ -32,9 +32,9 @@ static pin::Model read(const std::string& serialized) {
   return model;
 }
 
-Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(place_)) {
-  own = std::make_unique<Workspace>(read(serialized));
-  const pin::Model& model = own->model;
+Tree::Tree(const std::string& serialized, Indices q_index_) : q_index(std::move(q_index_)) {
+  workspace_ = std::make_unique<Workspace>(read(serialized));
+  const pin::Model& model = workspace_->model;
   n = model.nv, nq = model.nq, joints = model.njoints;
   support.resize(joints);
   ancestors.resize(n), joint_of.resize(n), parent.assign(model.parents.begin(), model.parents.end());
@@ -42,7 +42,7 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
     if (model.nqs[joint] == 7)
       roots.push_back({model.idx_qs[joint], model.idx_vs[joint]});
     else
-      single.push_back(model.idx_vs[joint]);
+      single_dof.push_back(model.idx_vs[joint]);
     support[joint] = support[model.parents[joint]];
     for (int k = model.idx_vs[joint]; k < model.idx_vs[joint] + model.nvs[joint]; ++k) {
       support[joint].push_back(k);
@@ -54,89 +54,99 @@ Tree::Tree(const std::string& serialized, Indices place_) : place(std::move(plac
 
 Tree::~Tree() = default;
 
-void Tree::vary(Number what, In numbers) {
-  pin::Model& model = own->model;
+void Tree::set_parameters(Parameter what, In numbers) {
+  pin::Model& model = workspace_->model;
   const auto three = [&](int joint) { return Vector3(numbers.segment<3>(3 * joint)); };
-  if (what == Number::gravity) model.gravity.linear() = three(0);
-  if (what == Number::armature) model.armature = numbers;
+  if (what == Parameter::gravity) model.gravity.linear() = three(0);
+  if (what == Parameter::armature) model.armature = numbers;
   for (int joint = 0; joint < joints; ++joint) {
     pin::Inertia& body = model.inertias[joint];
-    if (what == Number::offset) model.jointPlacements[joint].translation() = three(joint);
-    if (what == Number::mass) body.mass() = numbers(joint);
-    if (what == Number::centre) body.lever() = three(joint);
-    if (what == Number::inertia) body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
+    if (what == Parameter::offset) model.jointPlacements[joint].translation() = three(joint);
+    if (what == Parameter::mass) body.mass() = numbers(joint);
+    if (what == Parameter::centre) body.lever() = three(joint);
+    if (what == Parameter::inertia)
+      body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
   }
 }
 
-void Tree::set(In q) { pin::computeJointJacobians(own->model, own->data, q); }
+void Tree::set_configuration(In q) { pin::computeJointJacobians(workspace_->model, workspace_->data, q); }
 
-const Matrix6x& Tree::jacobian() const { return own->data.J; }
+const Matrix6x& Tree::jacobian() const { return workspace_->data.J; }
 
-Matrix3 Tree::rotation(int joint) const { return own->data.oMi[joint].rotation(); }
+Matrix3 Tree::rotation(int joint) const { return workspace_->data.oMi[joint].rotation(); }
 
-Vector3 Tree::translation(int joint) const { return own->data.oMi[joint].translation(); }
+Vector3 Tree::translation(int joint) const { return workspace_->data.oMi[joint].translation(); }
 
-void Tree::inertia(In q) { pin::crba(own->model, own->data, q, pin::Convention::WORLD); }
+void Tree::compute_D(In q) { pin::crba(workspace_->model, workspace_->data, q, pin::Convention::WORLD); }
 
-const Matrix& Tree::D() const { return own->data.M; }
+const Matrix& Tree::D() const { return workspace_->data.M; }
 
-const Vector& Tree::bias(In q, In v) { return pin::nonLinearEffects(own->model, own->data, q, v); }
-
-Vector6 Tree::velocity(int joint) const { return own->data.oMi[joint].act(own->data.v[joint]).toVector(); }
-
-Vector6 Tree::acceleration(int joint) const {
-  // nonLinearEffects lets the world fall upwards instead of the bodies down
-  return own->data.oMi[joint].act(own->data.a_gf[joint]).toVector() + own->model.gravity.toVector();
+const Vector& Tree::compute_bias(In q, In v) {
+  return pin::nonLinearEffects(workspace_->model, workspace_->data, q, v);
 }
 
-const Vector& Tree::gravity(In q) { return pin::computeGeneralizedGravity(own->model, own->data, q); }
-
-const Matrix& Tree::coriolis(In q, In v) { return pin::computeCoriolisMatrix(own->model, own->data, q, v); }
-
-const Matrix6x& Tree::jacobian_dot() const { return own->data.dJ; }
-
-const Matrix6x& Tree::jacobian_rate(In q, In v) {
-  return pin::computeJointJacobiansTimeVariation(own->model, own->data, q, v);
+Vector6 Tree::velocity(int joint) const {
+  return workspace_->data.oMi[joint].act(workspace_->data.v[joint]).toVector();
 }
 
-double Tree::potential_energy(In q) { return pin::computePotentialEnergy(own->model, own->data, q); }
+Vector6 Tree::bias_acceleration(int joint) const {
+  // nonLinearEffects represents gravity as an upward acceleration of the world; undo that.
+  return workspace_->data.oMi[joint].act(workspace_->data.a_gf[joint]).toVector() +
+         workspace_->model.gravity.toVector();
+}
 
-void Tree::derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
-  pin::Model& model = own->model;
-  pin::Data& data = own->data;
+const Vector& Tree::compute_gravity(In q) {
+  return pin::computeGeneralizedGravity(workspace_->model, workspace_->data, q);
+}
+
+const Matrix& Tree::compute_coriolis(In q, In v) {
+  return pin::computeCoriolisMatrix(workspace_->model, workspace_->data, q, v);
+}
+
+const Matrix6x& Tree::jacobian_dot() const { return workspace_->data.dJ; }
+
+const Matrix6x& Tree::compute_jacobian_dot(In q, In v) {
+  return pin::computeJointJacobiansTimeVariation(workspace_->model, workspace_->data, q, v);
+}
+
+double Tree::potential_energy(In q) { return pin::computePotentialEnergy(workspace_->model, workspace_->data, q); }
+
+void Tree::compute_derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
+  pin::Model& model = workspace_->model;
+  pin::Data& data = workspace_->data;
   pin::computeRNEADerivatives(model, data, q, v, a);
   by_q = data.dtau_dq, by_v = data.dtau_dv;
-  if (gravity) return;  // placements, motions and the Jacobian are those there
+  if (gravity) return;  // placements, motions and Jacobian are those at this state
   Matrix of_gravity = Matrix::Zero(n, n);
   pin::computeGeneralizedGravityDerivatives(model, data, q, of_gravity);
   by_q -= of_gravity;
   pin::forwardKinematics(model, data, q, v, a);
-  set(q);
+  set_configuration(q);
 }
 
-Vector6 Tree::motion(int joint) const { return velocity(joint); }
-
-Vector6 Tree::motion_rate(int joint) const { return own->data.oMi[joint].act(own->data.a[joint]).toVector(); }
+Vector6 Tree::acceleration(int joint) const {
+  return workspace_->data.oMi[joint].act(workspace_->data.a[joint]).toVector();
+}
 
 Matrix6 Tree::spatial_inertia(int joint) const {
-  return joint ? own->data.oMi[joint].act(own->model.inertias[joint]).matrix() : Matrix6(Matrix6::Zero());
+  return joint ? workspace_->data.oMi[joint].act(workspace_->model.inertias[joint]).matrix() : Matrix6(Matrix6::Zero());
 }
 
 Tree::Body Tree::body(int joint) const {
-  const pin::Inertia there = own->data.oMi[joint].act(own->model.inertias[joint]);
-  return {there.mass(), there.lever(), there.inertia().matrix()};
+  const pin::Inertia body = workspace_->data.oMi[joint].act(workspace_->model.inertias[joint]);
+  return {body.mass(), body.lever(), body.inertia().matrix()};
 }
 
-const Vector& Tree::armature() const { return own->model.armature; }
+const Vector& Tree::armature() const { return workspace_->model.armature; }
 
-Vector6 Tree::field() const { return own->model.gravity.toVector(); }
+Vector6 Tree::spatial_gravity() const { return workspace_->model.gravity.toVector(); }
 
-static Eigen::Quaterniond turned(In q, Tree::Root root) {
+static Eigen::Quaterniond orientation_of(In q, Tree::Root root) {
   return Eigen::Quaterniond(Eigen::Vector4d(q.segment<4>(root.q + 3))).normalized();
 }
 
 static pin::SE3 placement(In q, Tree::Root root) {
-  return {turned(q, root).toRotationMatrix(), q.segment<3>(root.q)};
+  return {orientation_of(q, root).toRotationMatrix(), q.segment<3>(root.q)};
 }
 
 void Tree::normalize(Out q) const {
@@ -144,19 +154,20 @@ void Tree::normalize(Out q) const {
 }
 
 void Tree::integrate(Out q, In step) const {
-  for (int k : single) q(place[k]) += step(k);
+  for (int k : single_dof) q(q_index[k]) += step(k);
   for (const Root& root : roots) {
     const pin::SE3 there = placement(q, root) * pin::exp6(pin::Motion(step.segment<6>(root.v)));
-    Eigen::Quaterniond turn(there.rotation());
-    turn.normalize();
-    if (turn.dot(turned(q, root)) < 0) turn.coeffs() *= -1;  // of the two that mean the same the nearer one
+    Eigen::Quaterniond orientation(there.rotation());
+    orientation.normalize();
+    // Of the two quaternions of this rotation, take the one closer to the previous.
+    if (orientation.dot(orientation_of(q, root)) < 0) orientation.coeffs() *= -1;
     q.segment<3>(root.q) = there.translation();
-    q.segment<4>(root.q + 3) = turn.coeffs();
+    q.segment<4>(root.q + 3) = orientation.coeffs();
   }
 }
 
 void Tree::difference(In from, In to, Out step) const {
-  for (int k : single) step(k) = to(place[k]) - from(place[k]);
+  for (int k : single_dof) step(k) = to(q_index[k]) - from(q_index[k]);
   for (const Root& root : roots)
     step.segment<6>(root.v) = pin::log6(placement(from, root).actInv(placement(to, root))).toVector();
 }
@@ -168,92 +179,95 @@ void Tree::difference_rate(In from, In to, In v, Out rate) const {
 }
 
 void Tree::configuration_rate(In q, In v, Out q_dot) const {
-  for (int k : single) q_dot(place[k]) = v(k);
+  for (int k : single_dof) q_dot(q_index[k]) = v(k);
   for (const Root& root : roots) {
-    const Eigen::Quaterniond turn = turned(q, root);
+    const Eigen::Quaterniond orientation = orientation_of(q, root);
     Eigen::Quaterniond spin;  // half the angular velocity in the body's axes
     spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
-    q_dot.segment<3>(root.q) = turn * Vector3(v.segment<3>(root.v));
-    q_dot.segment<4>(root.q + 3) = (turn * spin).coeffs();
+    q_dot.segment<3>(root.q) = orientation * Vector3(v.segment<3>(root.v));
+    q_dot.segment<4>(root.q + 3) = (orientation * spin).coeffs();
   }
 }
 
-// That of `ckc_pin.mechanism.tree`.
-double Tree::coarseness(In q, In units) const {
+// The same as in `ckc_pin.mechanism.tree`.
+double Tree::tolerance_scale(In q, In units) const {
   constexpr double many = 100.0, most = 1e4;
   double largest = 0.0;
-  for (int k : single) largest = std::max(largest, std::abs(q(place[k])) / units(k));
-  for (const Root& root : roots) largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
+  for (int k : single_dof) largest = std::max(largest, std::abs(q(q_index[k])) / units(k));
+  for (const Root& root : roots)
+    largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
   return std::clamp(largest / many, 1.0, most);
 }
 
-Matrix Tree::tangents(In q) const {
-  Matrix found = Matrix::Zero(n, nq);
-  for (int k : single) found(k, place[k]) = 1.0;
+Matrix Tree::q_dot_to_tangent(In q) const {
+  Matrix matrix = Matrix::Zero(n, nq);
+  for (int k : single_dof) matrix(k, q_index[k]) = 1.0;
   for (const Root& root : roots) {
-    const Eigen::Quaterniond turn = turned(q, root);
+    const Eigen::Quaterniond orientation = orientation_of(q, root);
     const double size = q.segment<4>(root.q + 3).norm();
-    found.block<3, 3>(root.v, root.q) = turn.toRotationMatrix().transpose();
-    for (int k = 0; k < 4; ++k) {  // twice the vector part of conj(turn) times the change
+    matrix.block<3, 3>(root.v, root.q) = orientation.toRotationMatrix().transpose();
+    for (int k = 0; k < 4; ++k) {  // twice the vector part of conj(orientation) times the change
       Eigen::Quaterniond change(0, 0, 0, 0);
       change.coeffs()(k) = 1.0;
-      found.block<3, 1>(root.v + 3, root.q + 3 + k) = 2.0 / size * (turn.conjugate() * change).vec();
+      matrix.block<3, 1>(root.v + 3, root.q + 3 + k) = 2.0 / size * (orientation.conjugate() * change).vec();
     }
   }
-  return found;
+  return matrix;
 }
 
-Matrix Tree::rate_changes(In q, In v) const {
-  Matrix found = Matrix::Zero(nq, n);
+Matrix Tree::configuration_rate_derivative(In q, In v) const {
+  Matrix matrix = Matrix::Zero(nq, n);
   for (const Root& root : roots) {
-    const Eigen::Quaterniond turn = turned(q, root);
+    const Eigen::Quaterniond orientation = orientation_of(q, root);
     Eigen::Quaterniond half, spin;
     spin.w() = 0.0, spin.vec() = 0.5 * v.segment<3>(root.v + 3);
     for (int k = 0; k < 3; ++k) {
       half.w() = 0.0, half.vec() = 0.5 * Vector3::Unit(k);
-      found.block<3, 1>(root.q, root.v + 3 + k) = turn * Vector3(Vector3::Unit(k).cross(Vector3(v.segment<3>(root.v))));
-      found.block<4, 1>(root.q + 3, root.v + 3 + k) = (turn * half * spin).coeffs();
+      matrix.block<3, 1>(root.q, root.v + 3 + k) =
+          orientation * Vector3(Vector3::Unit(k).cross(Vector3(v.segment<3>(root.v))));
+      matrix.block<4, 1>(root.q + 3, root.v + 3 + k) = (orientation * half * spin).coeffs();
     }
   }
-  return found;
+  return matrix;
 }
 
 void Tree::add_bracket(In v, In x, Out sum) const {
   for (const Root& root : roots) {
     const Vector3 slide = v.segment<3>(root.v), spin = v.segment<3>(root.v + 3);
-    const Vector3 moved = x.segment<3>(root.v), turned = x.segment<3>(root.v + 3);
-    sum.segment<3>(root.v) += spin.cross(moved) + slide.cross(turned);
-    sum.segment<3>(root.v + 3) += spin.cross(turned);
+    const Vector3 moved = x.segment<3>(root.v), orientation_of = x.segment<3>(root.v + 3);
+    sum.segment<3>(root.v) += spin.cross(moved) + slide.cross(orientation_of);
+    sum.segment<3>(root.v + 3) += spin.cross(orientation_of);
   }
 }
 
-Matrix Tree::brackets(In v) const {
-  Matrix found = Matrix::Zero(n, n);
+Matrix Tree::bracket_matrix(In v) const {
+  Matrix matrix = Matrix::Zero(n, n);
   for (const Root& root : roots)
-    for (int k = root.v; k < root.v + 6; ++k) add_bracket(v, Vector::Unit(n, k), found.col(k));
-  return found;
+    for (int k = root.v; k < root.v + 6; ++k) add_bracket(v, Vector::Unit(n, k), matrix.col(k));
+  return matrix;
 }
 
-Matrix3 Tree::orientation(In q, Root root) const { return turned(q, root).toRotationMatrix(); }
+Matrix3 Tree::orientation(In q, Root root) const { return orientation_of(q, root).toRotationMatrix(); }
 
 Vector6 Tree::twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const {
   return pin::log6(placement(q, root).actInv(pin::SE3(orientation, position))).toVector();
 }
 
 void Tree::to_coordinates(In q, Out numbers) const {
-  for (int k : single) numbers(k) = q(place[k]);
+  for (int k : single_dof) numbers(k) = q(q_index[k]);
   for (const Root& root : roots) {
     numbers.segment<3>(root.v) = q.segment<3>(root.q);
-    numbers.segment<3>(root.v + 3) = pin::log3(turned(q, root).toRotationMatrix());
+    numbers.segment<3>(root.v + 3) = pin::log3(orientation_of(q, root).toRotationMatrix());
   }
 }
 
-double Tree::coordinate_step(In q, int k, In step) const {
+double Tree::coordinate_change(In q, int k, In step) const {
   for (const Root& root : roots) {
     if (k < root.v || k >= root.v + 6) continue;
-    const Matrix3 turn = turned(q, root).toRotationMatrix();
+    const Matrix3 orientation = orientation_of(q, root).toRotationMatrix();
     const int row = k - root.v;
-    return row < 3 ? turn.row(row).dot(step.segment<3>(root.v)) : Jlog3(turn).row(row - 3).dot(step.segment<3>(root.v + 3));
+    return row < 3 ? orientation.row(row).dot(step.segment<3>(root.v))
+                   : Jlog3(orientation).row(row - 3).dot(step.segment<3>(root.v + 3));
   }
   return step(k);
 }

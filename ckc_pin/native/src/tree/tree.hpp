@@ -1,4 +1,4 @@
-// The tree: Pinocchio's model and one workspace for it. The only file that sees Pinocchio is tree.cpp.
+// The kinematic tree: Pinocchio's model and data. tree.cpp is the only file that includes Pinocchio.
 #pragma once
 
 #include <memory>
@@ -8,90 +8,96 @@
 
 namespace ckc {
 
-// Pinocchio computes into one workspace: what `place` gives is read before the next call, what `bias` gives too.
+// A kinematic tree and one workspace for its terms. References that a method returns are valid until the next call.
 class Tree {
  public:
-  // A model as Pinocchio serializes it in binary, and where the coordinate of each tangent direction stands in q'.
-  Tree(const std::string& serialized, Indices place);
+  // `serialized`: a model in Pinocchio's binary format. `q_index`: for each tangent coordinate, its index in q'.
+  Tree(const std::string& serialized, Indices q_index);
   ~Tree();
 
   int n, nq, joints;
-  Indices place;                  // (n)
-  struct Root { int q, v; };      // where a free root's seven numbers and its six velocities begin
+  Indices q_index;  // (n)
+  struct Root {
+    int q, v;
+  };  // where the seven numbers and the six velocities of a free root begin
   std::vector<Root> roots;
-  Indices single;                 // tangent coordinates of joints of one freedom
-  std::vector<Indices> support;   // by joint: the tangent coordinates that move it, ascending
-  std::vector<Indices> ancestors; // by coordinate: those at or above it on its branch, where D' is not zero
-  Indices joint_of;               // by coordinate: the joint that it is of
-  Indices parent;                 // by joint
+  Indices single_dof;              // tangent coordinates of joints with one degree of freedom
+  std::vector<Indices> support;    // by joint: the tangent coordinates that move it, ascending
+  std::vector<Indices> ancestors;  // by coordinate: those at or above it on its branch, where D' is not zero
+  Indices joint_of;                // by coordinate: its joint
+  Indices parent;                  // by joint
 
-  // Other numbers of the model, all joints' one after the other.
-  enum class Number { gravity, offset, mass, centre, inertia, armature };
-  void vary(Number what, In numbers);
+  // Replace one kind of parameter for all joints. `numbers`: concatenated by joint.
+  enum class Parameter { gravity, offset, mass, centre, inertia, armature };
+  void set_parameters(Parameter what, In numbers);
 
-  // How much coarser loops close at q than near zero, at least one: coordinates are rounded as they are large.
-  double coarseness(In q, In units) const;
+  // Factor (at least one) by which closure tolerances grow at q: large coordinates carry larger rounding errors.
+  double tolerance_scale(In q, In units) const;
 
-  // Placements of all joints, and the Jacobian in world axes.
-  void set(In q);
+  // Compute the placements of all joints and the Jacobian, in world axes.
+  void set_configuration(In q);
   const Matrix6x& jacobian() const;
   Matrix3 rotation(int joint) const;
   Vector3 translation(int joint) const;
 
-  // D', upper triangle, with everything that `set` gives.
-  void inertia(In q);
+  // Compute the upper triangle of D', and everything that `set_configuration` computes.
+  void compute_D(In q);
   const Matrix& D() const;
 
-  // C'v + h', and the spatial velocities of all joints with what of their accelerations is there at dv/dt = 0.
-  const Vector& bias(In q, In v);
-  Vector6 velocity(int joint) const;      // world axes, at the world's origin: (linear, angular)
-  Vector6 acceleration(int joint) const;  // J_dot v
+  // Compute C'v + h', the spatial velocities, and the accelerations at dv/dt = 0.
+  const Vector& compute_bias(In q, In v);
+  Vector6 velocity(int joint) const;           // (linear, angular) in world axes, at the world's origin
+  Vector6 bias_acceleration(int joint) const;  // J_dot v; requires `compute_bias`
 
-  const Vector& gravity(In q);               // h'
-  const Matrix& coriolis(In q, In v);        // C', Christoffel
-  const Matrix6x& jacobian_dot() const;      // after `coriolis`: d/dt of `jacobian`
-  const Matrix6x& jacobian_rate(In q, In v); // the same without C'
+  const Vector& compute_gravity(In q);               // h'
+  const Matrix& compute_coriolis(In q, In v);        // C' with Christoffel symbols
+  const Matrix6x& jacobian_dot() const;              // d/dt of `jacobian`; requires `compute_coriolis`
+  const Matrix6x& compute_jacobian_dot(In q, In v);  // the same, without computing C'
   double potential_energy(In q);
 
-  // The motion with an acceleration, and how D'a + C'v + h' changes along each coordinate and with each velocity; with
-  // `gravity` or without. What follows is that of `set` too, and the motion in the world's axes, at its origin.
-  void derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v);
-  Vector6 motion(int joint) const;        // velocity
-  Vector6 motion_rate(int joint) const;   // its rate, without gravity
+  // Compute the derivatives of D'a + C'v + h' (h' only if `gravity`) with respect to q' (tangent) and v'. Afterwards,
+  // placements, the Jacobian, `velocity` and `acceleration` are those at this state.
+  void compute_derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v);
+  Vector6 acceleration(int joint) const;  // without gravity; requires `compute_derivatives`
   Matrix6 spatial_inertia(int joint) const;
-  Vector6 field() const;                  // gravity
-  struct Body { double mass; Vector3 centre; Matrix3 inertia; };
-  Body body(int joint) const;             // in the world's axes, its inertia about its centre
+  Vector6 spatial_gravity() const;  // spatial vector
+  struct Body {
+    double mass;
+    Vector3 centre;
+    Matrix3 inertia;
+  };
+  Body body(int joint) const;  // in world axes, the inertia about the centre of mass
   const Vector& armature() const;
 
-  // On q' itself: a free root's place is a position and a unit quaternion, moved by a twist in its axes.
+  // Operations on q' itself. A free root has a position and a unit quaternion, and moves by a twist in its own axes.
   void normalize(Out q) const;
-  void integrate(Out q, In step) const;  // by a tangent step, in place
+  void integrate(Out q, In step) const;  // q <- q + step, in tangent coordinates
   void difference(In from, In to, Out step) const;
-  void difference_rate(In from, In to, In v, Out rate) const;  // where `to` moves with v
+  void difference_rate(In from, In to, In v, Out rate) const;  // d/dt of `difference` where `to` moves with v
   void configuration_rate(In q, In v, Out q_dot) const;
-  Matrix tangents(In q) const;               // (n, nq): tangent steps by changes of q'
-  Matrix rate_changes(In q, In v) const;     // (nq, n): of `configuration_rate` by tangent steps
-  // What a free root's twist adds to the rate of a tangent step x: x_dot = v_change - brackets(v) x.
-  Matrix brackets(In v) const;               // (n, n)
-  void add_bracket(In v, In x, Out sum) const;  // brackets(v) x, which is - brackets(x) v
-  void to_coordinates(In q, Out numbers) const;  // (n); rotations as rotation vectors
-  double coordinate_step(In q, int k, In step) const;  // of one of those, for a step of the tangent coordinates
+  Matrix q_dot_to_tangent(In q) const;  // (n, nq): maps a change of q' to a tangent step
+  // (nq, n): derivative of `configuration_rate` with respect to tangent steps
+  Matrix configuration_rate_derivative(In q, In v) const;
+  // The rate of a tangent step x along a motion v: x_dot = delta_v - bracket_matrix(v) x. Zero without free roots.
+  Matrix bracket_matrix(In v) const;                     // (n, n)
+  void add_bracket(In v, In x, Out sum) const;           // sum += bracket_matrix(v) x
+  void to_coordinates(In q, Out numbers) const;          // (n); rotations as rotation vectors
+  double coordinate_change(In q, int k, In step) const;  // change of coordinate k for a tangent step
   Matrix3 orientation(In q, Root root) const;
-  // The twist in a free root's axes that takes it to another place.
+  // Twist, in the free root's axes, that moves it to another placement.
   Vector6 twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const;
 
  private:
   struct Workspace;
-  std::unique_ptr<Workspace> own;
+  std::unique_ptr<Workspace> workspace_;
 };
 
-// The rotation vector of a rotation, angle at most pi; its inverse; and d log3 along a rotation in its own axes.
+// Rotation vector of a rotation (angle at most pi), the inverse map, and the Jacobian of log3.
 Vector3 log3(const Matrix3& rotation);
 Matrix3 exp3(const Vector3& vector);
 Matrix3 Jlog3(const Matrix3& rotation);
 
-// The version of Pinocchio that this was compiled against.
+// Version of Pinocchio that the core was compiled against.
 std::string pinocchio_version();
 
 }  // namespace ckc

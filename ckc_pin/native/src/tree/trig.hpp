@@ -1,4 +1,4 @@
-// Cosines and sines of many angles at once.
+// Cosines and sines of several angles at once, cached for the last angles.
 #pragma once
 
 #include "tree/types.hpp"
@@ -7,8 +7,8 @@ namespace ckc {
 
 class Trig {
  public:
-  // The cosines of x, then the sines; computed again when x is another one.
-  const double* of(In x) const {
+  // Return the cosines of x, followed by the sines. They are computed again only if x has changed.
+  const double* cosines_and_sines(In x) const {
     if (x.size() == x_.size() && x == x_) return values_.data();
     return compute(x);
   }

@@ -1,4 +1,4 @@
-// Names that every file uses.
+// Types that every file uses. `In` and `Out` are vector arguments, passed without a copy.
 #pragma once
 
 #include <Eigen/Core>
@@ -21,7 +21,8 @@ using Indices = std::vector<int>;
 using In = const Eigen::Ref<const Vector>&;
 using Out = Eigen::Ref<Vector>;
 
-// Eigen's own ends at the first that is not, which keeps it from taking several at once.
+// Whether all numbers are finite. Eigen's allFinite returns at the first one that is not, which prevents
+// vectorization.
 inline bool finite(In x) {
   unsigned none = 0;
   for (Eigen::Index k = 0; k < x.size(); ++k) none |= !(std::abs(x(k)) <= std::numeric_limits<double>::max());
