@@ -1,8 +1,9 @@
 """Constraint rows as CasADi expressions: phi, J and J_dot v.
 
 Constraint rows are implemented three times, from the same primitives of `mechanism.rows`: in NumPy
-(`mechanism/rows.py`), as the readable reference and for batches of configurations; in C++ (`native/src/rows.cpp`), for
-runs; and here, because compiled terms need expressions that CasADi can differentiate and simplify for one mechanism.
+(`mechanism/rows.py`), as the readable reference and for batches of configurations; in C++
+(`native/src/loops/rows.cpp`), for runs; and here, because compiled terms need expressions that CasADi can differentiate
+and simplify for one mechanism.
 `tests/codegen/test_rows_agree.py` compares all three for every row type.
 """
 

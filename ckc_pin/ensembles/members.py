@@ -46,7 +46,7 @@ PENDING, DONE, STOPPED, FAILED = range(4)
 Statuses = NDArray[np.uint8]
 STATUS = ("pending", "done", "stopped", "failed")
 MIN_RHS_TO_COMPILE = 1_000_000  # right-hand sides for each coordinate, from which compiling terms saves time
-END, EVENT = "end", "event"
+END, EVENT = _core.StopReason.END.value, _core.StopReason.EVENT.value
 MAX_INTEGER = 2.0**63  # of an integer in a scene
 BATCHED_NUMBERS = {
     "gravity", "offset", "mass", "centre", "inertia", "point", "end", "length", "constant", "joint_stiffness",
@@ -246,30 +246,32 @@ class Members:
             return 0
         if status == "interrupted":
             raise interrupt_again(message)
-        return int(self.ready.loop.stats()["rhs"])
+        return int(self.ready.loop.stats().rhs)
 
     def _run_batch(self, values: Array, recorded: Recorded, status: Statuses, message: list[str]) -> int:
         """Run the members that a batch can take; enter their results, and return their right-hand sides."""
         if self._batch is None:
             _, *tables = self.ready.tables  # the scene's compiled terms may lack parameters that are zero in the scene
             core = core_table(self.mechanism, self._library, self.scene.spec.friction_smoothing or 0.0)
-            self._batch = _core.Batch(core, *tables, self.mechanism.tolerance, self._threads)
+            self._batch = _core.Batch(core, *tables, tolerance=self.mechanism.tolerance, threads=self._threads)
         numbers, is_physical = self._numbers.evaluate(values[:, self._parameters])
         batched = np.flatnonzero(is_physical)
         count = len(batched)
         if not count:
             return 0
-        columns = [(name, x[batched].reshape(count, -1)) for name, x in numbers.items()]
+        parameters = [(_core.CoreParameter[name.upper()], x[batched].reshape(count, -1)) for name, x in numbers.items()]
         if numbers and self._library is not None:
-            columns.append(("written", self._numbers.arguments(numbers, len(values))[batched]))
+            parameters.append((_core.CoreParameter.COMPILED, self._numbers.arguments(numbers, len(values))[batched]))
         q, q_dot = self._compute_starts(values[batched])
         recorded_by_key = {"last": recorded.last_row, "kept": recorded.series, "met": recorded.event_times}
         out: dict[str, Any] = {name: np.zeros(count, np.int64) for name in ("why", "filled")}
         out |= {"work": np.zeros(3 * count, np.int64), "t": np.empty(count)}
         out |= {key: np.full((count, *array.shape[1:]), np.nan) for key, array in recorded_by_key.items()}
-        self._batch.run(self._base, q, q_dot, [(name, np.ascontiguousarray(x)) for name, x in columns], self.instants,
-                        self.outputs.columns, self.scene.spec.t_end, out)  # fmt: skip
-        reasons = np.array([*_core.reasons, "start"])[out["why"]]
+        self._batch.run(
+            self._base, q, q_dot, parameters=[(kind, np.ascontiguousarray(x)) for kind, x in parameters],
+            instants=self.instants, columns=self.outputs.columns, until=self.scene.spec.t_end, out=out,
+        )  # fmt: skip
+        reasons = out["why"]  # values of StopReason; -1: the member could not be started
         is_regular = np.isin(reasons, (END, EVENT)) & (out["filled"] > 0)
         for key, array in recorded_by_key.items():
             array[batched[is_regular]] = out[key][is_regular]
@@ -331,7 +333,7 @@ class Members:
         member_outputs = Outputs(self._output_specs, ready)  # output instants and q_d may differ between members
         for name, value in member_outputs.compute(member_outputs.record(rows)).items():
             outputs[name][k] = value[0]
-        rhs = ready.loop.stats()["rhs"]
+        rhs = ready.loop.stats().rhs
         status, message = (
             (DONE, "" if message == "reached t_end" else message) if ended == "done" else (STOPPED, message)
         )

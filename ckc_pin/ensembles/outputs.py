@@ -90,7 +90,7 @@ class Outputs:
     """
 
     def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
-        self._ready, self._slices = ready, record_columns(ready.mechanism)
+        self._ready, self._slices = ready, record_columns(ready.loop)
         self._units = quantity_units(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
@@ -116,8 +116,8 @@ class Outputs:
             if i is not None:
                 series[0, :, i] = row[self.columns]
         event_times = np.full((1, len(events)), np.nan)
-        for t, event, _ in self._ready.loop.met():
-            event_times[0, event] = np.fmin(event_times[0, event], t)
+        for occurrence in self._ready.loop.occurrences():
+            event_times[0, occurrence.event] = np.fmin(event_times[0, occurrence.event], occurrence.t)
         return Recorded(rows[-1:], series, event_times)
 
     @property

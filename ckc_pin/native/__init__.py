@@ -1,6 +1,6 @@
-"""The native core: where time advances. A mechanism crosses to C++ as the tables that Python itself evaluates."""
+"""The C++ core, which integrates the motion. It is built from tables of a mechanism, its controller and its events."""
 
-import pinocchio as pin  # first: it loads the libraries that the core is linked with
+import pinocchio as pin  # before _core: it loads the libraries that _core is linked with
 
 from ckc_pin.native import _core
 

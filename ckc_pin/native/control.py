@@ -1,4 +1,7 @@
-"""What acts on a mechanism as the tables that cross to C++: eqs. 14 and 16, any other controller as a call."""
+"""Tables that describe controllers and motors to the C++ core.
+
+Eqs. 14 and 16 and torques over time run in the core; any other controller is called from it.
+"""
 
 from __future__ import annotations
 
@@ -35,31 +38,32 @@ def control_table(
     actuation: Actuation,
     call: Callable[[Controller | TorqueController], Callable[..., Any]],
     *,
-    differs: bool = False,
+    differentiates: bool = False,
 ) -> dict[str, Any]:
-    """Describe what acts.
+    """Return the table of a controller, its sampling and its motors.
 
     Parameters
     ----------
     controller : Controller, TorqueController, Sampled or None
     actuation : Actuation
     call : callable
-        Makes of a controller that only Python knows a function of the loop's view of its state, to u or tau.
-    differs : bool
-        Whether how such a one changes with the state is wanted, by differences.
+        Wraps a controller that the core does not implement as a function of the core's view of the state, which
+        returns u or tau.
+    differentiates : bool
+        The core differentiates such a controller with respect to the state by finite differences.
 
     Raises
     ------
     InputError
-        A controller without u or tau, a sensor or a drive for what is not there.
+        The controller has neither u nor tau, or a sensor or drive names a coordinate or motor that does not exist.
     """
     table = actuation_table(actuation)
     if isinstance(controller, Sampled):
         clock, controller = controller, controller.controller
         table["clock"] = _clock(clock.sample_time, clock.delay)
-        looks = type(controller) is not SetPoint or (clock.drive is not None and not actuation.is_direct)
+        closes = type(controller) is not SetPoint or (clock.drive is not None and not actuation.is_direct)
         if clock.sensor is not None:
-            table["sensor"] = _sensor(clock.sensor, actuation.mechanism, clock.sample_time, closes=looks)
+            table["sensor"] = _sensor(clock.sensor, actuation.mechanism, clock.sample_time, closes=closes)
         if clock.drive is not None:
             table["drive"] = _drive(clock.drive, actuation)
     if controller is None:
@@ -67,15 +71,20 @@ def control_table(
     torques = is_torque_controller(controller)
     if type(controller) is RecordedTorques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
-        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds=not controller.interpolates)
-    own = {"kind": "call", "function": call(controller), "of_motors": torques, "differs": differs}
-    return table | {"law": law_table(controller) or own}
+        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds_output=not controller.interpolates)
+    callback = {
+        "kind": "call",
+        "function": call(controller),
+        "outputs_torques": torques,
+        "differentiates": differentiates,
+    }
+    return table | {"law": law_table(controller) or callback}
 
 
 def actuation_table(actuation: Actuation) -> dict[str, Any]:
-    """Describe how motors turn u to their torques."""
+    """Return the table of the allocation of generalized forces to motors."""
     return {
-        "turns": np.asfortranarray(actuation.motors.transmission),
+        "transmission": np.asfortranarray(actuation.motors.transmission),
         "direct": actuation.is_direct,
         "limit": actuation.limit,
         "weights": actuation.weights,
@@ -83,21 +92,28 @@ def actuation_table(actuation: Actuation) -> dict[str, Any]:
     }
 
 
-def _clock(period: float, delay: float = 0.0, times: Array | None = None, *, holds: bool = True) -> dict[str, Any]:
-    return {"period": period, "delay": delay, "times": np.zeros(0) if times is None else times, "holds": holds}
+def _clock(
+    period: float, delay: float = 0.0, times: Array | None = None, *, holds_output: bool = True
+) -> dict[str, Any]:
+    return {
+        "period": period,
+        "delay": delay,
+        "times": np.zeros(0) if times is None else times,
+        "holds_output": holds_output,
+    }
 
 
 def _sensor(sensor: SensorSpec, mechanism: Mechanism, period: float, *, closes: bool) -> dict[str, Any]:
-    """Describe a sensor; `closes`: the controller looks at more than q and q_dot, so the loops are closed at those."""
+    """Return the table of a sensor; `closes`: the controller needs more than q and q_dot, so the loops are closed."""
     table: dict[str, Any] = {
-        "differences": sensor.rate == "difference",
+        "differentiates": sensor.rate == "difference",
         "smoothing": 1.0 if sensor.filter is None else -math.expm1(-period / sensor.filter),
         "seed": sensor.seed,
     }
     names = mechanism.independent
     for key in ("resolution", "q_noise", "q_dot_noise"):
-        given = getattr(sensor, key)
-        values = given if isinstance(given, dict) else dict.fromkeys(names, given)
+        value = getattr(sensor, key)
+        values = value if isinstance(value, dict) else dict.fromkeys(names, value)
         table[key] = mechanism.vector(values, names, f"controller.sensor.{key}", fill=0.0)
     return {**table, "observer": core_table(mechanism)} if closes else table
 
@@ -105,19 +121,19 @@ def _sensor(sensor: SensorSpec, mechanism: Mechanism, period: float, *, closes: 
 def _drive(drive: DriveSpec, actuation: Actuation) -> dict[str, Any]:
     table = {}
     for key, name, absent in (("resolution", "torque_resolution", 0.0), ("rate", "torque_rate", np.inf)):
-        given = getattr(drive, name)
-        values = given if isinstance(given, dict) else dict.fromkeys(actuation.motors.names, given or absent)
+        value = getattr(drive, name)
+        values = value if isinstance(value, dict) else dict.fromkeys(actuation.motors.names, value or absent)
         table[key] = actuation.motors.vector(values, f"controller.drive.{name}", absent)
     return table
 
 
 def law_table(controller: Controller | TorqueController) -> dict[str, Any] | None:
-    """Return eq. 14, eq. 16 or torques over time; None for any other controller."""
+    """Return the table of eq. 14, eq. 16 or torques over time; None for any other controller."""
     if type(controller) is RecordedTorques:
         tau = np.asfortranarray(controller.values.T)
-        return {"kind": "torques", "times": controller.times, "tau": tau, "lines": controller.interpolates}
+        return {"kind": "torques", "times": controller.times, "tau": tau, "interpolates": controller.interpolates}
     if type(controller) is SetPoint:
-        target = controller.target  # what it compensates is a constant, whichever model that is of
+        target = controller.target  # the compensated forces are constant, also if they are another model's
         gains = {"K_P": controller.K_P, "K_V": controller.K_V}
         return {"kind": "set_point", **gains, "q_d": controller.q_d, "h_d": target.h,
                 "potential": target.potential_energy}  # fmt: skip
@@ -158,7 +174,7 @@ def _harmonics(offset: Array, amplitude: Array, frequency: Array, phase: Array) 
 
 
 def _spline(table: Table) -> dict[str, Any]:
-    """Return a spline as Taylor polynomials: breaks, and by power, the highest first, a row of coefficients a piece."""
+    """Return a spline as Taylor polynomials: breaks, and by power from the highest, coefficients by piece."""
     spline = table.spline
     breaks = np.unique(spline.t)
     powers = range(spline.k, -1, -1)
@@ -167,7 +183,7 @@ def _spline(table: Table) -> dict[str, Any]:
 
 
 def _point(path: PointPath) -> dict[str, Any] | None:
-    """Return a point's path: the rows of Psi, which of them are prescribed, and configurations along it."""
+    """Return the table of a point's path: rows of Psi, which of them are prescribed, configurations along it."""
     point, place = path.point, _desired(path.path)
     extended, mechanism = point.extended, point.mechanism
     if place is None:
@@ -180,7 +196,7 @@ def _point(path: PointPath) -> dict[str, Any] | None:
     return {
         "kind": "point",
         "model": packed(mechanism.tree.model),
-        "place": mechanism.tree.q_index.tolist(),
+        "q_index": mechanism.tree.q_index.tolist(),
         "closure": closure_table(extended.closure, mechanism.n),
         "psi": psi.tolist(),
         "axis": axis.tolist(),

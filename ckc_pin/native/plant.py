@@ -1,14 +1,14 @@
-"""Exact derivatives of eq. 1: of its acceleration and multipliers by configuration, velocity and force.
+"""Exact derivatives of the acceleration and multipliers of eq. 1 with respect to configuration, velocity and force.
 
-With R = D' a + C' v' + h' - f(q', v') - u' - J^T lambda and phi_ddot = J a + J_dot v', both zero, any change of the
-state obeys
+With R = D' a + C' v' + h' - f(q', v') - u' - J^T lambda = 0 and phi_ddot = J a + J_dot v' = 0, a change of the state
+satisfies
 
     D' da - J^T dlambda = -dR,    J da = -dphi_ddot,
 
-where dR and dphi_ddot are taken with a and lambda constant: by the terms written out, where they were compiled, or by
-Pinocchio's analytic derivatives of the tree's inverse dynamics, those of springs and dampers, and the rows' own second
-and third ones. Nothing is differenced. Derivatives by q' are along the tangent coordinates, with the numbers of v', a
-and u' constant.
+where dR and dphi_ddot are the derivatives at constant a and lambda. They come from compiled terms, or from Pinocchio's
+analytic derivatives of the tree's inverse dynamics, those of springs and dampers, and the rows' second and third
+derivatives; finite differences are not used. Derivatives with respect to q' are along the tangent coordinates, at
+constant coordinates of v', a and u'.
 """
 
 from __future__ import annotations
@@ -29,34 +29,33 @@ __all__ = ["LOST_RANK", "NONE", "AccelerationDerivatives", "Plant"]
 
 NONE = np.zeros(0, dtype=np.intp)
 LOST_RANK = (
-    "the loop closure's Jacobian J has lost rank: branches of the motion meet here, and no linear model describes them "
-    "all; take another configuration"
+    "the loop closure's Jacobian J has lost rank: branches of the motion meet at this configuration, so there is no "
+    "linear model; take another configuration"
 )
 
 
 @dataclass(frozen=True)
 class AccelerationDerivatives:
-    """Eq. 1 solved at one state, its solution's derivatives, and both in minimal coordinates.
+    """Solution of eq. 1 at one state, its derivatives, and the linear model in minimal coordinates.
 
-    The states are d coordinates of the tree and their rates. With T what those rates make of v', and V what a change of
-    the coordinates asks of v' so that the loops stay closed, the change of the acceleration along them is
-    (a_q T + a_v V) dq + a_v T dq_dot + a_u du'. Where rows are redundant, derivatives are meant along motions that the
-    loops allow: across them the loops contradict each other.
+    The states are d coordinates of the tree and their velocities. With v' = T q_dot and V = d(v')/dq at closed loops,
+    the change of the acceleration is (a_q T + a_v V) dq + a_v T dq_dot + a_u du'. With redundant rows, the derivatives
+    hold along admissible motions only.
 
     Attributes
     ----------
     acceleration : (n,) array
-        a, the rate of v'.
+        a, the time derivative of v'.
     multipliers : (rows,) array
-        Of least norm, N or N m.
+        Minimum-norm multipliers, N or N m.
     at : (d,) int array
-        The coordinates that the states are of: `independent`, or others where those are no chart.
+        Coordinates of the states: `independent`, or others where those are singular.
     T, V : (n, d) arrays
-        Zero and identity, or zero, in the rows `at`.
+        The rows `at` of T are the identity, those of V zero.
     A : (2 d, 2 d) array
     B : (2 d, motors) array
     a_q, a_v, a_u : (n, n) arrays
-        Of a by q' (tangent coordinates), v' and u'.
+        Derivatives of a with respect to q' (tangent coordinates), v' and u'.
     multipliers_q, multipliers_v, multipliers_u : (rows, n) arrays
     """
 
@@ -76,48 +75,48 @@ class AccelerationDerivatives:
 
 
 class Plant:
-    """A mechanism whose eq. 1 is differentiated at one state after another.
+    """Evaluates eq. 1 and its derivatives at states of a mechanism.
 
     Parameters
     ----------
     mechanism : Mechanism
     smoothing : float, optional
-        Rate over which dry friction grows as tanh, rad/s or m/s; absent, there is none.
+        Velocity scale of the tanh of dry friction, rad/s or m/s. By default, there is no friction.
     library : Library, optional
-        Its terms, compiled; absent, they are Pinocchio's.
+        The mechanism's compiled terms. By default, terms are evaluated with Pinocchio.
     """
 
     def __init__(self, mechanism: Mechanism, smoothing: float | None = None, library: Library | None = None) -> None:
         self.mechanism = mechanism
-        self._native = _core.Plant(core_table(mechanism, library, smoothing), mechanism.motors.transmission)
+        self._native = _core.Linearization(core_table(mechanism, library, smoothing), mechanism.motors.transmission)
 
     def at(self, terms: Terms, u_tree: Array, locked: IntArray = NONE) -> AccelerationDerivatives:
-        """Solve eq. 1 and differentiate it.
+        """Solve eq. 1 at a state and differentiate the solution.
 
         Parameters
         ----------
         terms : Terms
             The state.
         u_tree : (n,) array
-            Forces on the tree that do not change with the state: of actuators, and of joints that slide.
+            Forces on the tree that do not depend on the state: of actuators and of sliding joints.
         locked : int array, optional
-            Coordinates that do not move, as of joints that stick: their forces follow.
+            Coordinates that do not move, as of sticking joints.
 
         Raises
         ------
         NumericalError
-            J has lost rank.
+            J is rank deficient.
         """
-        found = self._native.at(terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist())
-        if found is None:
+        solution = self._native.at(terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist())
+        if solution is None:
             tree = self.mechanism.tree
             raise NumericalError(
                 LOST_RANK,
                 q_tree=tree.named(tree.to_coordinates(terms.q_tree)),
             )
-        found["at"] = np.array(found["at"], dtype=np.intp)
-        return AccelerationDerivatives(**found)
+        solution["at"] = np.array(solution["at"], dtype=np.intp)
+        return AccelerationDerivatives(**solution)
 
     def seconds(self, terms: Terms, u_tree: Array, rounds: int = 2000) -> float:
-        """Return how long A and B take, s, the least of many."""
+        """Return the minimum time of an evaluation of A and B over many rounds, s."""
         return float(self._native.seconds(terms.q_tree, terms.v_tree, u_tree, rounds))

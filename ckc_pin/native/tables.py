@@ -1,4 +1,4 @@
-"""A mechanism as the tables that cross to C++: the rows, springs and partition that Python itself evaluates."""
+"""Tables that describe a mechanism to the C++ core: model, constraint rows, springs, joints and partition."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ __all__ = ["closure_table", "core_table", "packed"]
 
 
 def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: float | None = None) -> dict[str, Any]:
-    """Return what a native core of a mechanism is made of; each has a workspace of its own.
+    """Return the table from which a core of a mechanism is built.
 
     Parameters
     ----------
     mechanism : Mechanism
     library : Library, optional
-        Its terms, compiled; absent, they are Pinocchio's.
+        The mechanism's compiled terms. By default, the core evaluates the terms with Pinocchio.
     smoothing : float, optional
-        Of a core that moves: the rate over which dry friction grows, rad/s or m/s; zero where joints stick. Absent,
-        joints neither rub nor stop.
+        Velocity scale of regularized dry friction, rad/s or m/s; zero for joints that stick. By default, the core has
+        no friction and no joint stops.
     """
     rows, columns = jacobian_scales(mechanism.tree, mechanism.closure)
-    written = {} if library is None else {"written": (library.path, library.parameters)}
+    compiled = {} if library is None else {"compiled": (library.path, library.parameters)}
     return {
-        **written,
+        **compiled,
         "model": packed(mechanism.tree.model),
-        "place": mechanism.tree.q_index.tolist(),
+        "q_index": mechanism.tree.q_index.tolist(),
         "closure": closure_table(mechanism.closure, mechanism.n),
         "springs": _springs(mechanism.springs),
         "joints": _joints(mechanism, smoothing),
@@ -49,15 +49,15 @@ def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: 
 
 
 def packed(model: Any) -> bytes:
-    """Return a model as Pinocchio serializes it, in binary: as text that takes fifteen times as long."""
+    """Return Pinocchio's binary serialization of a model; its text format is fifteen times slower."""
     buffer = pin.serialization.StreamBuffer()
     model.saveToBinary(buffer)
-    found: bytes = buffer.tobytes()
-    return found
+    data: bytes = buffer.tobytes()
+    return data
 
 
 def closure_table(closure: Closure, n: int) -> dict[str, Any]:
-    """Return the rows of a closure, by primitive."""
+    """Return the constraint rows of a closure by kind."""
     anchors = closure.anchors
     table: dict[str, Any] = {name: [] for name in ("component", "dot", "distance", "affine", "log")}
     numbers: dict[str, list[Array]] = {"length": [np.zeros(0)], "affine_matrix": [np.zeros((0, n))],
@@ -81,7 +81,7 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
                 numbers["rotation_a"].append(_matrix(group.rotation_a.reshape(-1, 9), 9))
                 numbers["rotation_b"].append(_matrix(group.rotation_b.reshape(-1, 9), 9))
             case _:
-                raise TypeError(f"{type(group).__name__}: no such primitive crosses to the native core")
+                raise TypeError(f"{type(group).__name__}: the core has no constraint rows of this kind")
     return {
         **table,
         **{name: np.concatenate(parts) for name, parts in numbers.items()},
@@ -95,11 +95,11 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
 
 def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
     joints, n = mechanism.joints, mechanism.n
-    acts = smoothing is not None
+    moves = smoothing is not None
     return {
-        "friction": joints.friction if acts else np.zeros(n),
-        "lower": joints.lower if acts else np.full(n, -np.inf),
-        "upper": joints.upper if acts else np.full(n, np.inf),
+        "friction": joints.friction if moves else np.zeros(n),
+        "lower": joints.lower if moves else np.full(n, -np.inf),
+        "upper": joints.upper if moves else np.full(n, np.inf),
         "restitution": joints.restitution,
         "reach": mechanism.tree.step_scale,
         "size": mechanism.size,

@@ -61,4 +61,4 @@ def compile_during_run(mechanism: Mechanism, loop: Any, missing_arguments: Mappi
     """
     with suppress(InputError):
         library = compile_terms(mechanism, missing_arguments, directional_derivatives=missing_arguments is not None)
-        loop.write((library.path, library.parameters))
+        loop.use_compiled_terms((library.path, library.parameters))

@@ -20,6 +20,7 @@ from ckc_pin.base.validation import require_controller_signature, require_type
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native import _core
 from ckc_pin.run.loop_terms import wrap_event_function
 from ckc_pin.scene.spec import EventSpec
 
@@ -27,7 +28,6 @@ __all__ = ["Event", "EventFunction", "build_event_functions", "list_occurrences"
 
 # A coordinate or rate this close to the value counts as being on it: rad, m, rad/s, m/s.
 VALUE_TOLERANCE = 1e-12
-QUANTITIES = {"q": 0, "q_dot": 1, "sigma_min_phi_z": 2, "sigma_min_J": 3, "function": 4}  # the native loop's numbers
 
 
 @dataclass(frozen=True)
@@ -78,17 +78,17 @@ class EventFunction:
     ----------
     label : dict
         name, of, coordinate and value of its occurrences.
-    row : tuple
-        Arguments of the native event: quantity, coordinate, value, sign, direction, stop, tolerance, function.
+    event : _core.Event
+        The event of the native loop.
     """
 
     label: dict[str, Any]
-    row: tuple[Any, ...]
+    event: _core.Event
 
     @property
     def stop(self) -> bool:
         """Whether a run ends at the event."""
-        return bool(self.row[5])
+        return self.event.stop
 
     def occurrence(self, t: float, direction: int) -> dict[str, Any]:
         """Return an entry of `Run.events`."""
@@ -123,21 +123,26 @@ def build_event_functions(
         name = event.name or getattr(event.function, "__name__", "event")
         label = {"name": name, "of": "function", "coordinate": None, "value": 0.0}
         call = wrap_event_function(event.function, name, mechanism)
-        row = (QUANTITIES["function"], 0, 0.0, 1.0, event.direction, event.stop, 0.0, call)
-        functions.append(EventFunction(label, row))
+        native_event = _core.Event(
+            quantity=_core.EventQuantity.FUNCTION, direction=event.direction, stop=event.stop, function=call
+        )
+        functions.append(EventFunction(label, native_event))
     return functions
 
 
-def list_occurrences(functions: Sequence[EventFunction], mechanism: Mechanism, loop: Any) -> list[dict[str, Any]]:
+def list_occurrences(
+    functions: Sequence[EventFunction], mechanism: Mechanism, loop: _core.Loop
+) -> list[dict[str, Any]]:
     """Return the entries of `Run.events` in order of time: crossings and mode transitions of joints."""
-    occurrences = [functions[k].occurrence(t, direction) for t, k, direction in loop.met()]
-    for t, k, transition, direction in loop.joint_changes():
+    occurrences = [functions[x.event].occurrence(x.t, x.direction) for x in loop.occurrences()]
+    for transition in loop.joint_transitions():
+        k, kind, direction = transition.coordinate, transition.kind, transition.direction
         of, value = "friction", 0.0
-        if transition not in ("sticks", "slides"):
+        if kind not in (_core.JointTransitionKind.STICKS, _core.JointTransitionKind.SLIDES):
             of, value = "stop", float((mechanism.joints.lower if direction < 0 else mechanism.joints.upper)[k])
         name = mechanism.coordinates[k]
-        label = {"name": f"{name} {transition}", "of": of, "coordinate": name}
-        occurrences.append({"t": t, **label, "value": value, "direction": direction, "stop": False})
+        label = {"name": f"{name} {kind.name.lower()}", "of": of, "coordinate": name}
+        occurrences.append({"t": transition.t, **label, "value": value, "direction": direction, "stop": False})
     return sorted(occurrences, key=lambda event: float(event["t"]))
 
 
@@ -152,8 +157,11 @@ def _scene_event_functions(spec: EventSpec, mechanism: Mechanism, where: str) ->
     quantity = spec.of if coordinate is None else coordinate if spec.of == "q" else f"{coordinate}'s rate"
     label = {"name": f"{quantity} = {value:g}", "of": spec.of, "coordinate": coordinate, "value": value}
     k = 0 if coordinate is None else mechanism.tree.index[coordinate]
-    row = (QUANTITIES[spec.of], k, value, 1.0, spec.direction, spec.stop, VALUE_TOLERANCE, None)
-    return [EventFunction(label, row)]
+    event = _core.Event(
+        quantity=_core.EventQuantity[spec.of.upper()], coordinate=k, value=value,
+        direction=spec.direction, stop=spec.stop, zero_threshold=VALUE_TOLERANCE,
+    )  # fmt: skip
+    return [EventFunction(label, event)]
 
 
 def _limit_functions(spec: EventSpec, mechanism: Mechanism, where: str) -> list[EventFunction]:
@@ -171,6 +179,9 @@ def _limit_functions(spec: EventSpec, mechanism: Mechanism, where: str) -> list[
         for side, limit, sign in (("lower", float(lower[k]), -1.0), ("upper", float(upper[k]), 1.0)):
             if np.isfinite(limit):
                 label = {"name": f"{name} at its {side} limit", "of": "limit", "coordinate": name, "value": limit}
-                row = (QUANTITIES["q"], k, limit, sign, spec.direction, spec.stop, VALUE_TOLERANCE, None)
-                functions.append(EventFunction(label, row))
+                event = _core.Event(
+                    quantity=_core.EventQuantity.Q, coordinate=k, value=limit, sign=sign,
+                    direction=spec.direction, stop=spec.stop, zero_threshold=VALUE_TOLERANCE,
+                )  # fmt: skip
+                functions.append(EventFunction(label, event))
     return functions

@@ -20,8 +20,8 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.control import control_table
+from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
-from ckc_pin.native.variation import SensitivityParameter
 from ckc_pin.run.checks import require_runnable
 from ckc_pin.run.compiled_terms import NEVER, select_library
 from ckc_pin.run.events import Event, EventFunction, build_event_functions
@@ -55,7 +55,7 @@ class ParameterDerivatives:
     ----------
     sensitivity_parameters : tuple of SensitivityParameter
     table : dict
-        The entry "variation" of the formulation's table.
+        The entry "sensitivities" of the formulation's table.
     parameter_library : Library or None
         Compiled terms that have these derivatives.
     missing_arguments : dict of str to bool arrays, or None
@@ -102,7 +102,7 @@ class Prepared:
         Files of mechanism, scene and controller, by name.
     tables : tuple
         Arguments of the native loop: core, formulation, control, solver, events.
-    loop : native Loop
+    loop : _core.Loop
     derivatives : ParameterDerivatives or None
         Set if derivatives of the motion are integrated with it.
     """
@@ -116,7 +116,7 @@ class Prepared:
     start: Start
     texts: dict[str, str]
     tables: tuple[Any, ...]
-    loop: Any
+    loop: _core.Loop
     derivatives: ParameterDerivatives | None = None
 
     @property
@@ -194,13 +194,13 @@ def prepare(
     if derivatives is not None:
         parameter_derivatives = derivatives(scene, mechanism, controller, actuation, start)
         library = parameter_derivatives.parameter_library
-        formulation["variation"] = parameter_derivatives.table
+        formulation["sensitivities"] = parameter_derivatives.table
     with scene.sources.prefix_errors():
         control = control_table(
             controller,
             actuation,
             partial(wrap_controller, mechanism=mechanism),
-            differs=parameter_derivatives is not None,
+            differentiates=parameter_derivatives is not None,
         )
     library = library or select_library(mechanism, scene.spec.solver.terms)
     tables = (
@@ -208,7 +208,7 @@ def prepare(
         formulation,
         control,
         _solver_table(mechanism, scene.spec, profile=profile),
-        [function.row for function in functions],
+        [function.event for function in functions],
     )
     return Prepared(
         scene=scene,
@@ -265,7 +265,7 @@ def _formulation_table(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarr
             f"initial.w: joints of {mechanism.name} that stick or rest at stops cannot be held off phi = 0; remove it"
         )
     evenness = min(1.0, MAX_INERTIA_RATIO * float(inertias.min()) / float(inertias.max()))
-    return {"kind": "level_set", **table, "slack": CLOSURE_TOLERANCE * spec.solver.rtol * mechanism.size * evenness}
+    return {"kind": "level_set", **table, "rhs_slack": CLOSURE_TOLERANCE * spec.solver.rtol * mechanism.size * evenness}
 
 
 def _solver_table(mechanism: Mechanism, spec: SceneSpec, *, profile: bool) -> dict[str, Any]:
@@ -279,6 +279,6 @@ def _solver_table(mechanism: Mechanism, spec: SceneSpec, *, profile: bool) -> di
         "max_step": solver.max_step or math.inf,
         "min_step": solver.min_step,
         "max_rhs": solver.max_rhs or NEVER,
-        "closed": max(COLLOCATION_TOLERANCE * mechanism.size, 10 * mechanism.tolerance),
+        "manifold_tolerance": max(COLLOCATION_TOLERANCE * mechanism.size, 10 * mechanism.tolerance),
         "profile": profile,
     }

@@ -16,14 +16,14 @@ from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native._core import Loop, StopReason
 from ckc_pin.run.compiled_terms import COMPILE_AFTER_RHS, NEVER, compile_during_run
 from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.loop_terms import require_number
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
-from ckc_pin.run.stop_reasons import PAUSE_S, Stop, describe_stop
+from ckc_pin.run.stop_reasons import PAUSE_S, describe_stop
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
@@ -138,7 +138,7 @@ def build_run(prepared: Prepared, rows: Array, *, status: Status, message: str, 
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=list_occurrences(prepared.events, mechanism, loop),
-        stats={**loop.stats(), "wall_s": wall_s},
+        stats={**loop.stats().to_dict(), "wall_s": wall_s},
         scene_name=scene.name,
         scene=scene.to_dict(),
         texts=prepared.texts,
@@ -157,31 +157,31 @@ def _advance_to_end(
     deadline = perf_counter() + (solver.max_wall_s or np.inf)
     n, shown, filled = prepared.mechanism.n, 0, 0
     may_compile = solver.terms == "auto" and (
-        loop.stats()["terms"] == "pinocchio" or prepared.missing_arguments is not None
+        loop.stats().terms == "pinocchio" or prepared.missing_arguments is not None
     )
     loop.pause_at(COMPILE_AFTER_RHS if may_compile else NEVER)
     try:
         while True:
-            stop = Stop(*loop.advance(until=t_end, final=True, pause=PAUSE_S, budget=deadline - perf_counter()))
-            if may_compile and stop.why == "pause" and loop.stats()["rhs"] >= COMPILE_AFTER_RHS:
+            stop = loop.advance(until=t_end, final=True, pause=PAUSE_S, budget=deadline - perf_counter())
+            if may_compile and stop.reason == StopReason.PAUSE and loop.stats().rhs >= COMPILE_AFTER_RHS:
                 may_compile = False
                 loop.pause_at(NEVER)
                 if loop.t <= t_end / 2:
                     compile_during_run(prepared.mechanism, loop, prepared.missing_arguments)
-            filled = stop.filled
+            filled = loop.filled
             if on_output is not None:
                 for row in rows[shown:filled]:
                     on_output(float(row[0]), row[1 : 1 + n].copy())  # The caller may write to its copy.
                 shown = filled
             if progress is not None:
                 progress(loop.t, t_end)
-            if stop.why == "end":
+            if stop.reason == StopReason.END:
                 return "done", "reached t_end", filled
-            if stop.why == "event":
+            if stop.reason == StopReason.EVENT:
                 events = prepared.events
-                name = next(events[k].label["name"] for _, k, _ in reversed(loop.met()) if events[k].stop)
+                name = next(events[x.event].label["name"] for x in reversed(loop.occurrences()) if events[x.event].stop)
                 return "done", f"stopped by the event at t = {stop.t:.9g} s: {name}", filled
-            if stop.why != "pause":
+            if stop.reason != StopReason.PAUSE:
                 break
     except KeyboardInterrupt as signal:
         if not loop.filled:  # For example in the first call of the caller's controller.
@@ -200,19 +200,15 @@ def _advance_to_end(
 def _split_rows(prepared: Prepared, rows: Array) -> dict[str, Array]:
     """Return the recorded quantities by name, a row for each instant."""
     parts: dict[str, Array] = {}
-    for name, columns in record_columns(prepared.mechanism).items():
+    for name, columns in record_columns(prepared.loop).items():
         part = rows[:, columns].copy()
         parts[name] = part[:, 0] if name in SCALARS else part
     return parts
 
 
-def record_columns(mechanism: Mechanism) -> dict[str, slice]:
-    """Return the columns of each quantity in a row that the native loop records (`Recorder` in recorder.hpp)."""
-    n, m = mechanism.n, mechanism.closure.rows
-    widths = {"t": 1, "q_tree": n, "v_tree": n, "u": mechanism.d, "tau": len(mechanism.actuated), "phi": m, "w": m,
-              "energy": 1, "dissipated": 1, "lyapunov": 1, "max_phi": 1, "max_phi_dot": 1}  # fmt: skip
-    ends = np.cumsum([0, *widths.values()]).tolist()
-    return {name: slice(ends[k], ends[k + 1]) for k, name in enumerate(widths)}
+def record_columns(loop: Loop) -> dict[str, slice]:
+    """Return the columns of each quantity of a run in the rows of the native loop; sensitivities follow them."""
+    return {x.name: slice(x.begin, x.end) for x in loop.record_columns if x.name != "extra"}
 
 
 def _evaluate_lyapunov(prepared: Prepared, recorded: Array, parts: dict[str, Array]) -> Array | None:

@@ -17,11 +17,12 @@ from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.errors import InputError
 from ckc_pin.native import _core
+from ckc_pin.native._core import StopReason
 from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import format_work
 from ckc_pin.run.state import State
-from ckc_pin.run.stop_reasons import PAUSE_S, Stop, describe_stop
+from ckc_pin.run.stop_reasons import PAUSE_S, describe_stop
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import build_scene_controller
 from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, describe_formulation, make_scene
@@ -140,7 +141,7 @@ class Simulator(HasSummary):
     def stats(self) -> dict[str, Any]:
         """Evaluations since the last reset, by the names of `Run.stats`."""
         with self._stats:
-            return dict(self._loop.stats())
+            return self._loop.stats().to_dict()
 
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state. Earlier steps have no influence on the following ones.
@@ -210,8 +211,8 @@ class Simulator(HasSummary):
         """Advance to a time (s) with a constant effort: u or, with `of_motors`, tau."""
         try:
             while True:
-                result = self._loop.step(effort, of_motors=of_motors, until=until, pause=PAUSE_S)
-                if result is None or result[0][0] != "pause":
+                result = self._loop.step(effort, until, PAUSE_S, torques=of_motors)
+                if result is None or result[0].reason != StopReason.PAUSE:
                     break
         except BaseException:  # An event function may raise, and so does Ctrl-C.
             self._state = self._read_state()
@@ -221,9 +222,9 @@ class Simulator(HasSummary):
         stop, reached = result
         if reached is not None:
             self._state = State(self.mechanism, *reached)
-        if stop[0] not in ("end", "event"):
+        if stop.reason not in (StopReason.END, StopReason.EVENT):
             solver = self._prepared.scene.spec.solver
-            raise describe_stop(Stop(*stop), self._loop, self.mechanism, solver, self._prepared.events)
+            raise describe_stop(stop, self._loop, self.mechanism, solver, self._prepared.events)
         return self._state
 
     def _read_state(self) -> State:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native._core import Loop, RhsFailure, Stop, StopReason
 from ckc_pin.run.events import EventFunction
 from ckc_pin.scene.spec import SolverSpec
 
-__all__ = ["PAUSE_S", "Stop", "describe_singular_phi_z", "describe_stop"]
+__all__ = ["PAUSE_S", "describe_singular_phi_z", "describe_stop"]
 
 PAUSE_S = 0.05  # longest time that the native loop keeps the interpreter, and with it Ctrl-C, waiting, s
 SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one instant; relative to t, or s
@@ -20,108 +20,112 @@ SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one inst
 NEARLY_SINGULAR = 1e-3
 FRICTION_REMEDY = "a scene with friction_smoothing has no sticking, and a smaller solver.rtol may tell the joints apart"
 
-# By the native loop's name of the failure.
 STEP_FAILURES = {
-    "none": "the step size became so small that t does not change any more",
-    "open": "sigma(q) does not converge: the loops cannot be kept closed on the way",
-    "rank": "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
-    "vague": "phi_z is so nearly singular that the dependent coordinates are less accurate than solver.rtol asks",
-    "pole": "the required motor torque passes through infinity and jumps from one limit to the other: the parameter "
-    "derivative of that instant is unknown",
-    "shares": "motors at their torque limits cannot produce u together, and the parameter derivative of the torque "
-    "allocation is unknown",
-    "infinite": "its state or its right-hand side is not finite",
+    RhsFailure.NONE: "the step size became so small that t does not change any more",
+    RhsFailure.LOOPS_OPEN: "sigma(q) does not converge: the loops cannot be kept closed on the way",
+    RhsFailure.RANK_LOST: (
+        "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere"
+    ),
+    RhsFailure.Z_INACCURATE: (
+        "phi_z is so nearly singular that the dependent coordinates are less accurate than solver.rtol asks"
+    ),
+    RhsFailure.TORQUE_POLE: (
+        "the required motor torque passes through infinity and jumps from one limit to the other: the parameter "
+        "derivative of that instant is unknown"
+    ),
+    RhsFailure.ALLOCATION_NOT_DIFFERENTIABLE: (
+        "motors at their torque limits cannot produce u together, and the parameter derivative of the torque "
+        "allocation is unknown"
+    ),
+    RhsFailure.NOT_FINITE: "its state or its right-hand side is not finite",
 }
 
 
-class Stop(NamedTuple):
-    """Return value of the native loop: why it stopped, t (s), a value and an index for the reason, recorded rows."""
-
-    why: str
-    t: float
-    value: float
-    event: int
-    filled: int
-
-
 def describe_stop(
-    stop: Stop, loop: Any, mechanism: Mechanism, solver: SolverSpec, events: list[EventFunction]
+    stop: Stop, loop: Loop, mechanism: Mechanism, solver: SolverSpec, events: list[EventFunction]
 ) -> NumericalError:
     """Return the error for a stop, with the configuration where it matters."""
-    failure, says, u, sigma_min, margin, q_tree, q, z = loop.trouble()
-    where = mechanism.tree.named(mechanism.tree.to_coordinates(q_tree))
-    match stop.why:
-        case "rhs_budget":
+    failure = loop.failure()
+    sigma_min = failure.sigma_min
+    where = mechanism.tree.named(mechanism.tree.to_coordinates(failure.q_tree))
+    match stop.reason:
+        case StopReason.RHS_BUDGET:
             return NumericalError(f"the budget of max_rhs = {solver.max_rhs} right-hand sides is used up", t=loop.t)
-        case "wall_budget":
+        case StopReason.WALL_BUDGET:
             return NumericalError(f"the budget of max_wall_s = {solver.max_wall_s:g} s is used up", t=loop.t)
-        case "pace":
+        case StopReason.PACE:
             return NumericalError(
                 f"{_describe_fastest(loop, mechanism)}; {_describe_remaining_work(stop.value)}", t=loop.t
             )
-        case "rank":
+        case StopReason.RANK:
             return NumericalError(
                 f"J loses rank at t = {stop.t:.6g} s (smallest singular value {stop.value:.1g}): branches of the "
                 "motion meet there, and the loops do not determine one",
                 t=loop.t,
                 q_tree=where,
             )
-        case "chart" if not math.isfinite(sigma_min):
-            return NumericalError(f"the motion runs away: {STEP_FAILURES['infinite']}", t=loop.t)
-        case "chart":
-            return NumericalError(describe_singular_phi_z(mechanism, sigma_min, q, z), t=loop.t, q_tree=where)
-        case "energy":
+        case StopReason.COORDINATES_SINGULAR if not math.isfinite(sigma_min):
+            return NumericalError(f"the motion runs away: {STEP_FAILURES[RhsFailure.NOT_FINITE]}", t=loop.t)
+        case StopReason.COORDINATES_SINGULAR:
+            return NumericalError(
+                describe_singular_phi_z(mechanism, sigma_min, failure.q, failure.z), t=loop.t, q_tree=where
+            )
+        case StopReason.ENERGY:
             return NumericalError(
                 f"no force acts, but a step changes the energy by {stop.value:.2g} J at every step size",
                 t=loop.t,
                 q_tree=where,
             )
-        case "control":
-            return NumericalError(says or f"the controller's u is not finite: {u.tolist()}", t=loop.t)
-        case "chatter":
+        case StopReason.CONTROL:
+            return NumericalError(
+                failure.message or f"the controller's u is not finite: {failure.u.tolist()}", t=loop.t
+            )
+        case StopReason.CHATTER:
             return NumericalError(
                 f"{_list_last_transitions(loop, mechanism)} change between sticking, sliding and touching again and "
                 f"again at this instant{_describe_holding_forces(loop, mechanism)}; {FRICTION_REMEDY}",
                 t=loop.t,
                 q_tree=where,
             )
-        case "contact":
+        case StopReason.CONTACT_UNSOLVED:
             return NumericalError(
                 "no forces are found that hold the joints at their stops or at rest here"
                 f"{_describe_holding_forces(loop, mechanism)}; {FRICTION_REMEDY}",
                 t=loop.t,
                 q_tree=where,
             )
-        case "beyond_stop":
-            name = mechanism.coordinates[stop.event]
+        case StopReason.BEYOND_STOP:
+            name = mechanism.coordinates[stop.which]
             return NumericalError(
                 f"{name} has passed its stop within a step; a solver.max_step shorter than the time that {name} spends "
                 "beyond the stop finds the impact",
                 t=loop.t,
                 q_tree=where,
             )
-        case "function":
-            return NumericalError(f"the event {events[stop.event].label['name']!r} is {stop.value}", t=loop.t)
+        case StopReason.EVENT_FUNCTION:
+            return NumericalError(f"the event {events[stop.which].label['name']!r} is {stop.value}", t=loop.t)
     below_minimum = f"the step size fell below min_step = {solver.min_step:g} s"
-    reason = below_minimum if stop.why == "min_step" else STEP_FAILURES[failure]
-    if not margin <= NEARLY_SINGULAR:
+    reason = below_minimum if stop.reason == StopReason.MIN_STEP else STEP_FAILURES[failure.reason]
+    if not failure.margin <= NEARLY_SINGULAR:
         return NumericalError(reason, t=loop.t)
-    return NumericalError(f"{describe_singular_phi_z(mechanism, sigma_min, q, z)}; {reason}", t=loop.t, q_tree=where)
+    return NumericalError(
+        f"{describe_singular_phi_z(mechanism, sigma_min, failure.q, failure.z)}; {reason}", t=loop.t, q_tree=where
+    )
 
 
-def _list_last_transitions(loop: Any, mechanism: Mechanism) -> str:
+def _list_last_transitions(loop: Loop, mechanism: Mechanism) -> str:
     """Name the joints whose mode changed at the present instant."""
     tolerance = SAME_INSTANT_TOLERANCE * max(1.0, abs(loop.t))
-    names = [mechanism.coordinates[k] for t, k, *_ in loop.joint_changes() if loop.t - t <= tolerance]
+    names = [mechanism.coordinates[x.coordinate] for x in loop.joint_transitions() if loop.t - x.t <= tolerance]
     return ", ".join(dict.fromkeys(names)) or "joints"
 
 
-def _describe_holding_forces(loop: Any, mechanism: Mechanism) -> str:
+def _describe_holding_forces(loop: Loop, mechanism: Mechanism) -> str:
     """List the joints at rest with the forces that hold them and the bounds of these forces."""
     forces = [
-        f"{mechanism.coordinates[k]} {force:.6g} {'N' if mechanism.tree.in_metres[k] else 'N m'}, "
-        f"{low:.6g} to {high:.6g} being possible"
-        for k, force, low, high in loop.locked_joints()
+        f"{mechanism.coordinates[x.coordinate]} {x.force:.6g} "
+        f"{'N' if mechanism.tree.in_metres[x.coordinate] else 'N m'}, {x.lower:.6g} to {x.upper:.6g} being possible"
+        for x in loop.locked_joints()
     ]
     return f" (forces on the joints at rest: {'; '.join(forces)})" if forces else ""
 
@@ -133,7 +137,7 @@ def _describe_remaining_work(rhs: float) -> str:
     )
 
 
-def _describe_fastest(loop: Any, mechanism: Mechanism) -> str:
+def _describe_fastest(loop: Loop, mechanism: Mechanism) -> str:
     """Name the fastest coordinate, where lengths are compared relative to the mechanism's size."""
     tree = mechanism.tree
     state = loop.state()

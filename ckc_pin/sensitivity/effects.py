@@ -16,7 +16,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import split_name
 from ckc_pin.mechanism.rows import RelativeLog
-from ckc_pin.native.variation import Effect, Lock, Place
+from ckc_pin.native.sensitivity_tables import ParameterDerivative, PlacedKind, PlacementJoint
 
 __all__ = ["effects_of"]
 
@@ -28,7 +28,7 @@ BY_INDEX = (
 
 def effects_of(
     mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
-) -> tuple[Effect, ...]:
+) -> tuple[ParameterDerivative, ...]:
     """Return the effects of a parameter of the mechanism; none where the motion does not depend on it.
 
     Parameters
@@ -55,7 +55,7 @@ def effects_of(
     )
 
 
-def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[Effect]:
+def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """Effects on where joints, loop frames, spring ends and reported points are placed."""
     model, closure, springs = mechanism.tree.model, mechanism.closure, mechanism.springs
     zeros = np.zeros((model.njoints, 3, 3))
@@ -64,22 +64,22 @@ def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[E
         placement = model.jointPlacements[joint]
         turn = _angular(turned[joint], placement.rotation)
         slide = moved[joint] - np.cross(turn, placement.translation)  # of the carrier's origin
-        yield from _locks(model.parents[joint], "joint", joint, turn, slide)
-    carriers: dict[str, tuple[Place, list[int]]] = {
+        yield from _placement_joints(model.parents[joint], "joint", joint, turn, slide)
+    carriers: dict[str, tuple[PlacedKind, list[int]]] = {
         "point": ("point", list(closure.anchors.point_joint)),
         "end": ("spring", list(springs.anchors.point_joint)),
         "reported": ("reported", [frame.joint for frame in mechanism.points.values()]),
     }
     for key, (place, joints) in carriers.items():
         for k, slide in enumerate(slopes.get(key, ())):
-            yield from _locks(joints[k], place, k, np.zeros(3), slide)
+            yield from _placement_joints(joints[k], place, k, np.zeros(3), slide)
     for k, slope in enumerate(slopes.get("point_rotation", ())):
         loops = mechanism.spec.loop
         end, loop = divmod(k, len(loops))
         frame = mechanism.frames.find(loops[loop].frame_b if end else loops[loop].frame_a, "parameters")
         turn = _angular(slope, frame.rotation)
         for place, index in _directions(mechanism, loops[loop].name, end):
-            yield from _locks(frame.joint, place, index, turn, np.zeros(3))
+            yield from _placement_joints(frame.joint, place, index, turn, np.zeros(3))
 
 
 def _angular(slope: Array, rotation: Array) -> Array:
@@ -88,14 +88,18 @@ def _angular(slope: Array, rotation: Array) -> Array:
     return np.array([spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]]) / 2
 
 
-def _locks(carrier: int, place: Place, index: int, turn: Array, slide: Array) -> Iterator[Effect]:
+def _placement_joints(
+    carrier: int, place: PlacedKind, index: int, turn: Array, slide: Array
+) -> Iterator[ParameterDerivative]:
     for twist, turns in ((turn, True), (slide, False)):
         size = float(np.linalg.norm(twist))
         if size:
-            yield Effect("placement", index, np.array([size]), Lock(place, carrier, twist / size, turns=turns))
+            yield ParameterDerivative(
+                "placement", index, np.array([size]), PlacementJoint(place, carrier, twist / size, revolute=turns)
+            )
 
 
-def _directions(mechanism: Mechanism, loop: str, end: int) -> Iterator[tuple[Place, int]]:
+def _directions(mechanism: Mechanism, loop: str, end: int) -> Iterator[tuple[PlacedKind, int]]:
     """Directions and relative rotations that turn with a loop's frame."""
     closure, label = mechanism.closure, ("frame_a", "frame_b")[end]
     yield from (("direction", k) for k, frame in enumerate(closure.direction_frames) if frame == (loop, label))
@@ -105,36 +109,36 @@ def _directions(mechanism: Mechanism, loop: str, end: int) -> Iterator[tuple[Pla
             yield from (("log_b" if end else "log_a", k) for k, name in enumerate(loops) if name == loop)
 
 
-def _bodies(slopes: Mapping[str, Array]) -> Iterator[Effect]:
+def _bodies(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """Effects on bodies: mass, moment and inertia about the joint's origin."""
     keys = [key for key in ("mass", "moment", "origin_inertia") if key in slopes]
     for joint in sorted({int(k) for key in keys for k in np.argwhere(slopes[key])[:, 0]}):
         mass = slopes["mass"][joint] if "mass" in slopes else 0.0
         moment = slopes["moment"][joint] if "moment" in slopes else np.zeros(3)
         inertia = slopes["origin_inertia"][joint] if "origin_inertia" in slopes else np.zeros((3, 3))
-        yield Effect("inertia", joint, np.concatenate([[mass], moment, inertia[np.triu_indices(3)]]))
+        yield ParameterDerivative("inertia", joint, np.concatenate([[mass], moment, inertia[np.triu_indices(3)]]))
 
 
-def _entries(slopes: Mapping[str, Array]) -> Iterator[Effect]:
+def _entries(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """Effects on numbers that stand in the equations as in the file."""
     if "gravity" in slopes:
-        yield Effect("gravity", numbers=slopes["gravity"])
+        yield ParameterDerivative("gravity", values=slopes["gravity"])
     for key in BY_INDEX:
-        yield from (Effect(key, int(k), np.ones(1)) for k in np.flatnonzero(slopes.get(key, ())))
-    yield from (Effect("offset", int(k)) for k in np.flatnonzero(slopes.get("affine_offset", ())))
+        yield from (ParameterDerivative(key, int(k), np.ones(1)) for k in np.flatnonzero(slopes.get(key, ())))
+    yield from (ParameterDerivative("offset", int(k)) for k in np.flatnonzero(slopes.get("affine_offset", ())))
     for row, coordinate in np.argwhere(slopes.get("affine", np.zeros((0, 0)))):
-        yield Effect("ratio", int(row), np.array([coordinate], dtype=float))
+        yield ParameterDerivative("ratio", int(row), np.array([coordinate], dtype=float))
     for k in np.flatnonzero(slopes.get("armature", ())):
-        yield Effect("armature", int(k), slopes["armature"][k : k + 1])
+        yield ParameterDerivative("armature", int(k), slopes["armature"][k : k + 1])
 
 
-def _motors(mechanism: Mechanism, actuation: Actuation, slopes: Mapping[str, Array]) -> Iterator[Effect]:
+def _motors(mechanism: Mechanism, actuation: Actuation, slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """A gear acts where a motor's torque is what is given, a limit while it is reached."""
     for number in {int(k) for k in np.argwhere(slopes.get("turns", np.zeros((0, 0))))[:, 0]}:
-        yield Effect("gear", number, slopes["turns"][number])
+        yield ParameterDerivative("gear", number, slopes["turns"][number])
     for k in np.flatnonzero(slopes.get("torque_limit", ())):
         if mechanism.spec.motor[k].torque_limit == actuation.limit[k]:
-            yield Effect("torque_limit", int(k), mechanism.motors.transmission[k])
+            yield ParameterDerivative("torque_limit", int(k), mechanism.motors.transmission[k])
 
 
 def _require_motor_derivative(mechanism: Mechanism, actuation: Actuation, name: str) -> None:

@@ -39,7 +39,12 @@ from ckc_pin.mechanism.parameters import (
     values_of,
     with_components,
 )
-from ckc_pin.native.variation import Effect, SensitivityParameter, directions_of, variation_table
+from ckc_pin.native.sensitivity_tables import (
+    ParameterDerivative,
+    SensitivityParameter,
+    argument_directions,
+    sensitivity_table,
+)
 from ckc_pin.run.compiled_terms import select_derivative_library
 from ckc_pin.run.prepare import DerivativeSetup, ParameterDerivatives
 from ckc_pin.scene.initial import Start
@@ -72,9 +77,9 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
         require_movable(mechanism, overrides, parameters, rebuild)
         if scene.spec.initial.at == "assembled":
             parameters = [at_assembled_stop(mechanism, overrides, x, rebuild) for x in parameters]
-        arguments, directions = directions_of(mechanism, parameters) or (None, None)
+        arguments, directions = argument_directions(mechanism, parameters) or (None, None)
         library = select_derivative_library(mechanism, scene.spec.solver.terms, arguments)
-        table = variation_table(
+        table = sensitivity_table(
             mechanism, parameters, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=find_compensated_target(mechanism, law), controlled=controller is not None,
         )  # fmt: skip
@@ -117,7 +122,7 @@ def require_supported_scene(
         raise InputError("sensitivities support starts on phi = 0 only; remove initial.w")
     if spec.formulation == "dae" and (spec.solver.baumgarte or not spec.solver.projection):
         raise InputError("sensitivities need closed loops; remove solver.baumgarte, and set solver.projection = true")
-    shaping = next((x.name for x in parameters if any(contribution.is_shape for contribution in x.effects)), None)
+    shaping = next((x.name for x in parameters if any(effect.changes_closure for effect in x.effects)), None)
     if shaping is not None and type(controller) is Tracking and isinstance(controller.desired, PointPath):
         raise InputError(
             f"sensitivities: {shaping}: the controller makes a point follow a path, so q_d depends on the mechanism's "
@@ -137,7 +142,7 @@ def require_supported_scene(
                     f"sensitivities: {x.name} is 0, so stick-slip events are not monitored; give a small value, "
                     f"{x.name} = 1e-6 in [parameters], or friction_smoothing"
                 )
-    plant = [x.name for x in parameters if any(contribution.is_term for contribution in x.effects)]
+    plant = [x.name for x in parameters if any(effect.changes_terms for effect in x.effects)]
     if type(controller) is Tracking and controller.model is None and plant:
         raise InputError(
             f"sensitivities: {plant[0]}: tracking computes u from the mechanism's terms, whose derivatives are not "
@@ -176,7 +181,7 @@ def require_movable(
         return
     present = values_of(mechanism.spec, mechanism.urdf)
     for x in parameters:
-        if not any(contribution.is_shape for contribution in x.effects):
+        if not any(effect.changes_closure for effect in x.effects):
             continue
         whole, k = split_component(x.name)
         value = present[whole]
@@ -289,13 +294,13 @@ def _mechanism_parameter(
     mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
 ) -> SensitivityParameter:
     """Return a parameter of the mechanism. Effects on reported points only do not act on the motion."""
-    contributions = effects_of(mechanism, actuation, name, slopes)
-    placed = ["" if contribution.lock is None else contribution.lock.placed for contribution in contributions]
-    by_place = list(zip(placed, contributions, strict=True))
+    effects = effects_of(mechanism, actuation, name, slopes)
+    placed = ["" if effect.placement is None else effect.placement.placed for effect in effects]
+    by_place = list(zip(placed, effects, strict=True))
     return SensitivityParameter(
         name,
-        tuple(contribution for place, contribution in by_place if place != "reported"),
-        places=tuple(contribution for place, contribution in by_place if place in ("joint", "reported")),
+        tuple(effect for place, effect in by_place if place != "reported"),
+        placements=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
         slopes=slopes,
     )
 
@@ -309,10 +314,12 @@ def _controller_parameters(mechanism: Mechanism, scene: Scene, controller: objec
         derivatives = {f"controller.{key}": unit} if isinstance(getattr(spec, key), float | int) else {}
         derivatives |= {f"controller.{key}.{name}": np.diag(unit[k]) for k, name in enumerate(mechanism.independent)}
         for name, gain in derivatives.items():
-            yield SensitivityParameter(name, (Effect(kind, 0, gain.ravel(order="F")),))
+            yield SensitivityParameter(name, (ParameterDerivative(kind, 0, gain.ravel(order="F")),))
     if type(controller) is SetPoint and find_compensated_target(mechanism, controller).size:
         for k, name in enumerate(mechanism.independent):
-            yield SensitivityParameter(f"controller.q_d.{name}", (Effect("target", k, controller.K_P[:, k]),))
+            yield SensitivityParameter(
+                f"controller.q_d.{name}", (ParameterDerivative("target", k, controller.K_P[:, k]),)
+            )
 
 
 def _start_parameters(mechanism: Mechanism, scene: Scene, q_tree: Array) -> Iterator[SensitivityParameter]:

@@ -20,7 +20,8 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.native.variation import SensitivityParameter
+from ckc_pin.native._core import EventQuantity, NonDifferentiableReason
+from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.events import Event
 from ckc_pin.run.prepare import Prepared, prepare
@@ -32,7 +33,6 @@ from ckc_pin.sensitivity.parameters import derivatives_of
 __all__ = ["Sensitivities", "compute_point_sensitivities", "sensitivities"]
 
 EXPECTED_NAMES = 'a list of names, as ["link.link_2.mass"]'
-DIFFERENTIABLE_EVENTS = ("q", "q_dot")  # quantities whose events have times with a derivative
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -244,7 +244,7 @@ def sensitivities(
     message = _explain_missing_derivative(ready) or message
     _require_independent_terms(ready)
     run = build_run(ready, rows, status=status, message=message, wall_s=perf_counter() - started)
-    run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rates_found(), strict=True))
+    run.stats["changes_by_terms"] = dict(zip(("generated", "pinocchio"), ready.loop.rate_evaluations(), strict=True))
     q_tree, v_tree, u, tau = _split_rows(ready, rows)
     if np.isnan(q_tree[0]).any():
         raise NumericalError(f"sensitivities: {_explain_start(ready)}", t=0.0)
@@ -262,23 +262,22 @@ def _sensitivity_parameters(ready: Prepared) -> tuple[SensitivityParameter, ...]
 
 def _explain_missing_derivative(ready: Prepared) -> str | None:
     """Return why the motion is not differentiable where the run stopped, or None."""
-    event = ready.loop.apart()
+    event = ready.loop.non_differentiable_event()
     if event is None:
         return None
-    coordinate, at_rest, k, reason = event
-    joint, parameter = ready.mechanism.coordinates[coordinate], _sensitivity_parameters(ready)[k]
+    joint, parameter = ready.mechanism.coordinates[event.coordinate], _sensitivity_parameters(ready)[event.parameter]
     t, name = float(ready.loop.t), parameter.name
     where = "at the start" if t == 0.0 else f"at t = {t:.6g} s"
-    if t == 0.0 and parameter.assembled_at == coordinate:
+    if t == 0.0 and parameter.assembled_at == event.coordinate:
         cause = f"{joint} is assembled at its stop, and a step in {name} moves its start for one sign only"
-    elif reason == "let_go":
+    elif event.reason == NonDifferentiableReason.MARGINALLY_LOCKED:
         cause = f"the holding force of {joint} is at its limit, and one sign of a step in {name} releases {joint}"
-    elif reason == "restitution":
+    elif event.reason == NonDifferentiableReason.RESTITUTION:
         cause = (
             f"{joint} and joints that move only with it hit their stops at the same instant, and a step in {name} "
             "changes which of their restitutions counts"
         )
-    elif at_rest:
+    elif event.of_rate:
         cause = f"{joint} begins to move from rest, and after a step in {name} it is not at rest at this instant"
     else:
         cause = f"{joint} comes to its stop, and after a step in {name} it is not at its stop at this instant"
@@ -288,8 +287,8 @@ def _explain_missing_derivative(ready: Prepared) -> str | None:
 def _require_independent_terms(ready: Prepared) -> None:
     """Refuse a caller's controller that has read terms which depend on the parameters (InputError)."""
     parameters = _sensitivity_parameters(ready)
-    name = next((x.name for x in parameters if any(contribution.is_term for contribution in x.effects)), None)
-    if name is not None and ready.loop.asked():
+    name = next((x.name for x in parameters if any(effect.changes_terms for effect in x.effects)), None)
+    if name is not None and ready.loop.term_requested:
         raise InputError(
             f"sensitivities: {name}: the controller reads terms whose parameter dependence is unknown; "
             "use q, q_dot, q_tree and v_tree, and the terms of a separate mechanism"
@@ -331,14 +330,13 @@ def _split_rows(ready: Prepared, rows: Array) -> list[Array]:
 
 def _compute_end_time(ready: Prepared) -> Array | None:
     """Return the derivative of the time of the event that ended a run, (p,) in s."""
-    last = [event for _, k, _ in ready.loop.met() if (event := ready.events[k]).stop]
+    last = [event for x in ready.loop.occurrences() if (event := ready.events[x.event]).stop]
     if not last:
         return None
-    quantity, coordinate = last[-1].row[:2]
-    if quantity >= len(DIFFERENTIABLE_EVENTS):
+    final = last[-1].event
+    if final.quantity not in (EventQuantity.Q, EventQuantity.Q_DOT):
         return None
-    end_time: Array | None = ready.loop.delays(coordinate, DIFFERENTIABLE_EVENTS[quantity] == "q_dot")
-    return end_time
+    return ready.loop.time_shifts(final.coordinate, of_rate=final.quantity == EventQuantity.Q_DOT)
 
 
 def compute_point_sensitivities(
@@ -363,7 +361,7 @@ def compute_point_sensitivities(
     positions = {name: np.zeros((len(q_tree), 3, len(parameters))) for name in mechanism.points}
     if not positions:
         return positions
-    placing = [(k, parameter) for k, parameter in enumerate(parameters) if parameter.places]
+    placing = [(k, parameter) for k, parameter in enumerate(parameters) if parameter.placements]
     for row, (coordinates, derivative) in enumerate(zip(q_tree, by_parameter, strict=True)):
         q = mechanism.tree.from_coordinates(coordinates)
         for name, jacobian in mechanism.point_jacobians(q).items():
@@ -383,11 +381,11 @@ def _displace_by_placement(
 ) -> Array:
     """Return the derivative of a point's position by its own placement and by that of the joints that carry it."""
     total = np.zeros(3)
-    for contribution in parameter.places:
-        assert contribution.lock is not None
-        placed, index = contribution.lock.placed, contribution.index
+    for effect in parameter.placements:
+        assert effect.placement is not None
+        placed, index = effect.placement.placed, effect.index
         if (placed == "joint" and index in carriers) or (placed == "reported" and index == number):
-            axis = pose.rotation[contribution.lock.carrier] @ contribution.lock.axis
-            arm = position - pose.translation[contribution.lock.carrier]
-            total += contribution.numbers[0] * (np.cross(axis, arm) if contribution.lock.turns else axis)
+            axis = pose.rotation[effect.placement.carrier] @ effect.placement.axis
+            arm = position - pose.translation[effect.placement.carrier]
+            total += effect.values[0] * (np.cross(axis, arm) if effect.placement.revolute else axis)
     return total

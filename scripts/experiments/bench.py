@@ -94,7 +94,7 @@ def user_controller_us() -> float:
     scene = "five_bar/set_point"
     prepared = prepare_scene(scene, {"solver.output_dt": 5.0}, controller=UserSetPoint(scene))
     spent = min_processor_time(lambda: run_prepared(prepared), 15)
-    return 1e6 * spent / float(prepared.loop.stats()["rhs"])
+    return 1e6 * spent / float(prepared.loop.stats().rhs)
 
 
 def step_us(scene: str, overrides: dict[str, Any] | None = None) -> float:
@@ -133,7 +133,7 @@ def run_overhead_us() -> float:
     def native() -> None:
         prepared.begin()
         prepared.loop.record(times, rows)
-        prepared.loop.advance(until=1e-3, final=True, pause=0.05, budget=60.0)
+        prepared.loop.advance(1e-3, final=True, pause=0.05, budget=60.0)
 
     return 1e6 * (min_processor_time(lambda: run_prepared(prepared), 300) - min_processor_time(native, 300))
 

@@ -54,7 +54,7 @@ def jacobian() -> Measured:
     for terms in TERMS:
         loop = _loop("five_bar/swing", terms, {"formulation": "dae"})
         states = _perturbed_states(loop)
-        ratios.append(loop.seconds(states, 5000, True) / loop.seconds(states, 5000))
+        ratios.append(loop.seconds(states, 5000, of_jacobian=True) / loop.seconds(states, 5000))
     return ratios[0], ratios[1]
 
 

@@ -36,7 +36,7 @@ def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[
             began = process_time()
             record_rows(run)
             times.append(process_time() - began)
-    fastest, rhs = [min(times) for times in seconds], [run.loop.stats()["rhs"] for run in runs]
+    fastest, rhs = [min(times) for times in seconds], [run.loop.stats().rhs for run in runs]
     return [(a / fastest[0], b / rhs[0]) for a, b in zip(fastest[1:], rhs[1:], strict=True)]
 
 

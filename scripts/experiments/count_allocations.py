@@ -56,10 +56,10 @@ def main(library: Path) -> int:
 
         def stretch(end: float, loop: Any = loop) -> tuple[int, int, int]:
             stats, before = loop.stats(), counter()
-            loop.advance(until=end, final=False, pause=60.0, budget=60.0)
+            loop.advance(end, final=False, pause=60.0, budget=60.0)
             made = counter() - before
             now = loop.stats()
-            return made, now["steps"] - stats["steps"], now["jacobians"] - stats["jacobians"]
+            return made, now.steps - stats.steps, now.jacobians - stats.jacobians
 
         stretch(0.1)  # whatever grows has grown
         few, short, once = stretch(0.12)

@@ -82,7 +82,7 @@ def test_the_logarithm_of_a_rotation_differentiated_three_times(angle: float) ->
         return (jlog(v + h * Y) - jlog(v - h * Y)) / (2 * h)  # type: ignore[operator]
 
     twice = (change(U + h * Z) - change(U - h * Z)) / (2 * h)
-    value, along, along_twice = _core.log_rates(u, y, z)
+    value, along, along_twice = _core.log_jacobian(u, y, z)
     for ours, theirs in (
         (log_jacobian(u[None])[0] @ x, jlog(U)),
         (log_jacobian_dot(u[None], y[None])[0] @ x, change(U)),

@@ -68,7 +68,7 @@ def test_acceleration_of_a_light_leg_has_twelve_digits() -> None:
     settings = {**LIGHT_LEG, "formulation": "dae", "controller": None, "solver.terms": "generated"}
     ready = prepare(load_scene("stewart", settings))
     ready.begin()
-    ready.loop.advance(until=0.01, final=True, pause=1.0, budget=10.0)
+    ready.loop.advance(0.01, final=True, pause=1.0, budget=10.0)
     y, nq, n = ready.loop.y, ready.mechanism.tree.nq, ready.mechanism.n
     model = ManyDigits(ready.mechanism)
     right = model.acceleration(model.configuration(y[:nq]), exact(y[nq:]), exact(np.zeros(n)))[0].astype(float)

@@ -28,9 +28,9 @@ T_END = 0.6
 # --- within a step -------------------------------------------------------------------------------
 
 
-def _walk(function: Callable[[float], float], sign: int = 0, start: float = 0.0, end: float = 1.0) -> Any:
+def _sign_changes(function: Callable[[float], float], sign: int = 0, start: float = 0.0, end: float = 1.0) -> Any:
     """(found, the sign at the end, whether the end is on zero)."""
-    return _core.walk(function, start, end, sign, 0.0)
+    return _core.find_sign_changes(function, start, end, sign=sign)
 
 
 R = 1e-4  # half the distance of two roots
@@ -60,7 +60,7 @@ R = 1e-4  # half the distance of two roots
          "jump", "touch", "touch at a node", "miss", "constant", "zero"],
 )  # fmt: skip
 def test_sign_changes_within_a_step(function: Callable[[float], float], roots: list[tuple[float, int]]) -> None:
-    roots_found, _, _ = _walk(function)
+    roots_found, _, _ = _sign_changes(function)
     assert [direction for _, direction in roots_found] == [direction for _, direction in roots]
     # Near a double root, rounding moves the root by 1e-16 over the slope.
     assert_close([t for t, _ in roots_found], [t for t, _ in roots], 2e-12)
@@ -68,13 +68,13 @@ def test_sign_changes_within_a_step(function: Callable[[float], float], roots: l
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])
 def test_start_on_zero_counts_if_it_came_from_the_other_side(sign: int) -> None:
-    assert _walk(lambda t: t, sign) == ([(0.0, 1)] if sign == -1 else [], 1, False)
+    assert _sign_changes(lambda t: t, sign) == ([(0.0, 1)] if sign == -1 else [], 1, False)
 
 
 def test_end_on_zero_is_decided_by_the_next_step() -> None:
-    assert _walk(lambda t: t - 1.0) == ([], -1, True)
-    assert _walk(lambda t: t - 1.0, -1, 1.0, 2.0)[0] == [(1.0, 1)]
-    assert _walk(lambda t: 1.0 - t, -1, 1.0, 2.0)[0] == []
+    assert _sign_changes(lambda t: t - 1.0) == ([], -1, True)
+    assert _sign_changes(lambda t: t - 1.0, -1, 1.0, 2.0)[0] == [(1.0, 1)]
+    assert _sign_changes(lambda t: 1.0 - t, -1, 1.0, 2.0)[0] == []
 
 
 @pytest.mark.parametrize(("root", "slope"), [(0.3, 1.0), (0.3, -40.0), (0.0007, 1.0), (0.9995, 3.0)])
@@ -86,8 +86,8 @@ def test_root_search_uses_the_cheap_function_first(root: float, slope: float) ->
         asked.append(t)
         return float(slope * np.sinh(t - root))
 
-    roots_found, _, _ = _core.walk(
-        lambda t: float(slope * np.sinh(t - root) + 1e-7 * np.cos(5 * t)), 0.0, 1.0, 0, 0.0, exact
+    roots_found, _, _ = _core.find_sign_changes(
+        lambda t: float(slope * np.sinh(t - root) + 1e-7 * np.cos(5 * t)), 0.0, 1.0, exact=exact
     )
     assert_close([t for t, _ in roots_found], [root], 2e-12)
     assert len(asked) <= 2
@@ -97,9 +97,9 @@ def test_root_search_uses_the_cheap_function_first(root: float, slope: float) ->
 def test_exact_function_decides_between_nearly_equal_roots(off: float) -> None:
     """The cheap function has two roots where the exact one has none, or vice versa."""
     for depth in (0.5e-7, -0.5e-7):
-        roots_found, _, _ = _core.walk(
-            lambda t, depth=depth: (t - 0.3) ** 2 - depth + off, 0.0, 1.0, 0, 0.0,
-            lambda t, depth=depth: (t - 0.3) ** 2 - depth,
+        roots_found, _, _ = _core.find_sign_changes(
+            lambda t, depth=depth: (t - 0.3) ** 2 - depth + off, 0.0, 1.0,
+            exact=lambda t, depth=depth: (t - 0.3) ** 2 - depth,
         )  # fmt: skip
         assert [direction for _, direction in roots_found] == ([-1, 1] if depth > 0 else [])
         if depth > 0:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.native._core import StopReason
 from tests.analytic.five_bar import Array
 
 __all__ = ["steps_of"]
@@ -18,7 +19,8 @@ def steps_of(loop: Any, begin: Callable[[], None], t_end: float) -> Array:
     begin()
     ends: list[float] = []
     while not ends or ends[-1] < t_end:
-        assert loop.advance(until=t_end, final=True, pause=0.0, budget=math.inf)[0] in ("pause", "end")
+        stop = loop.advance(t_end, final=True, pause=0.0, budget=math.inf)
+        assert stop.reason in (StopReason.PAUSE, StopReason.END)
         if not ends or loop.t > ends[-1]:
             ends.append(loop.t)
     return np.array(ends)

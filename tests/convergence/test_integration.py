@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from ckc_pin.native._core import StopReason
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
@@ -58,7 +59,7 @@ def errors(exact: Exact, formulation: str, **solver: Any) -> tuple[Array, Array]
         rows = np.empty((len(times) + 1, ready.loop.width))
         ready.begin()
         ready.loop.record(times, rows)
-        assert ready.loop.advance(until=T_END, final=True, pause=math.inf, budget=math.inf)[0] == "end"
+        assert ready.loop.advance(T_END, final=True, pause=math.inf, budget=math.inf).reason == StopReason.END
         largest.append(np.max([error(row[0], row[1:5], row[5:9]) for row in rows[: len(times)]], axis=0))
     return largest[0], largest[1]
 

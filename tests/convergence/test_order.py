@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from ckc_pin.native._core import StopReason
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
@@ -74,7 +75,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
 
     def begin() -> None:
         ready.begin()
-        ready.loop.length = h  # instead of a short first step
+        ready.loop.step_size = h  # instead of the short one it would begin with
 
     ends = steps_of(ready.loop, begin, T_END)
     assert ends == pytest.approx(h * np.arange(1, steps + 1), rel=1e-12)
@@ -84,7 +85,7 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
         rows = np.empty((len(times) + 1, ready.loop.width))
         begin()
         ready.loop.record(times, rows)
-        assert ready.loop.advance(until=T_END, final=True, pause=math.inf, budget=math.inf)[0] == "end"
+        assert ready.loop.advance(T_END, final=True, pause=math.inf, budget=math.inf).reason == StopReason.END
         largest.append(max(np.abs(row[[1, 3, 5, 7]] - exact(row[0])).max() for row in rows[: len(times)]))
     return largest[0], largest[1]
 

@@ -12,7 +12,8 @@ from scipy.optimize import nnls
 from scipy.special import ellipk
 
 from ckc_pin import InputError, Run, load, sensitivities, simulate
-from ckc_pin.run.stop_reasons import Stop, describe_stop
+from ckc_pin.native._core import RhsFailure, StopReason
+from ckc_pin.run.stop_reasons import describe_stop
 from ckc_pin.scene.spec import SolverSpec
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
@@ -214,19 +215,25 @@ def test_bounces_decay_while_another_joint_rests_on_its_stop(tmp_path: Path, res
 def test_stop_reasons_at_contacts_name_joints_and_forces() -> None:
     """No known scene ends for these reasons, so the messages are tested with a stand-in for the loop."""
     bar = load("five_bar")
-    loop = SimpleNamespace(
-        t=0.5, trouble=lambda: ("none", "", np.zeros(2), 1.0, 1.0, bar.q_tree, [0, 2], [1, 3]),
-        joint_changes=lambda: [(0.1, 3, "slides", 1), (0.5, 0, "sticks", 0), (0.5, 2, "slides", 1)],
-        locked_joints=lambda: [(0, 2.5, -2.0, 2.0)],
+    failure = SimpleNamespace(
+        reason=RhsFailure.NONE, message="", u=np.zeros(2), sigma_min=1.0, margin=1.0,
+        q_tree=bar.q_tree, q=[0, 2], z=[1, 3],
     )  # fmt: skip
-    chatter, contact, beyond = (
-        str(describe_stop(Stop(why, 0.5, 0.0, 2, 1), loop, bar, SolverSpec(), []))
-        for why in ("chatter", "contact", "beyond_stop")
-    )
+    transitions = [SimpleNamespace(t=t, coordinate=k) for t, k in ((0.1, 3), (0.5, 0), (0.5, 2))]
+    loop: Any = SimpleNamespace(
+        t=0.5, failure=lambda: failure, joint_transitions=lambda: transitions,
+        locked_joints=lambda: [SimpleNamespace(coordinate=0, force=2.5, lower=-2.0, upper=2.0)],
+    )  # fmt: skip
+
+    def message(reason: StopReason) -> str:
+        stop: Any = SimpleNamespace(reason=reason, t=0.5, value=0.0, which=2)
+        return str(describe_stop(stop, loop, bar, SolverSpec(), []))
+
+    chatter, contact, beyond = map(message, (StopReason.CHATTER, StopReason.CONTACT_UNSOLVED, StopReason.BEYOND_STOP))
     assert "theta_1, theta_3 change between sticking, sliding and touching again and again at this instant" in chatter
-    for message in (chatter, contact):
-        assert "(forces on the joints at rest: theta_1 2.5 N m, -2 to 2 being possible); a scene with" in message
-    assert "theta_3 has passed its stop within a step; a solver.max_step shorter than" in beyond
+    for text in (chatter, contact):
+        assert "(forces on the joints at rest: theta_1 2.5 N m, -2 to 2 being possible); a scene with" in text
+    assert "theta_3 passed its stop within a step; a solver.max_step shorter than" in beyond
 
 
 def test_joints_fixed_by_loops_have_no_events(tmp_path: Path) -> None:

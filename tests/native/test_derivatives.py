@@ -102,7 +102,7 @@ def test_jacobians_of_right_hand_sides_are_exact(scene: str, overrides: dict[str
     J = ready.start.at.J
     free = np.eye(n) - np.linalg.pinv(J, rcond=1e-9) @ J
     y[-(d if reduced else n) :] += 0.3 * (random.uniform(-1, 1, d) if reduced else free @ random.uniform(-1, 1, n))
-    t, found, before = 0.1, loop.jacobian(0.1, y), loop.stats()["differences"]
+    t, found, before = 0.1, loop.jacobian(0.1, y), loop.stats().differences
     assert before == 0
     for _ in range(3):
         if reduced:

@@ -100,8 +100,8 @@ def test_a_coarse_tolerance_leaves_no_noise_in_jacobians(formulation):
 def test_the_modes_of_a_dae_are_those_of_the_reduced_model(scene):
     """From rest, where either linearization is that of the freedoms."""
     dae, reduced = (started(scene, {"formulation": formulation}).loop for formulation in ("dae", "reduced"))
-    found = np.linalg.eigvals(dae.modes(dae.jacobian(0.0, dae.y)))
-    wanted = np.linalg.eigvals(reduced.modes(reduced.jacobian(0.0, reduced.y)))
+    found = np.linalg.eigvals(dae.reduced_jacobian(dae.jacobian(0.0, dae.y)))
+    wanted = np.linalg.eigvals(reduced.reduced_jacobian(reduced.jacobian(0.0, reduced.y)))
     found, wanted = (values[np.argsort(-np.abs(values))] for values in (found, wanted))
     fast = np.count_nonzero(np.abs(wanted) > 0.5 * np.abs(wanted[0]))
     assert np.sort(found[:fast].real) == pytest.approx(np.sort(wanted[:fast].real), rel=0.05)
@@ -146,7 +146,7 @@ def test_states_are_put_on_the_closure_by_the_shortest_steps_in_the_metric_of_th
     ready, ivp = both(name, {"formulation": "dae"})
     for y in ivp.y0 + 1e-6 * np.random.default_rng(0).standard_normal((20, len(ivp.y0))):
         at, v = _closed(ivp.mechanism, y, _inertia(ivp.mechanism))
-        q_tree, velocity = ready.loop.on_closure(0.0, y)
+        q_tree, velocity = ready.loop.project(0.0, y)
         assert np.abs(q_tree - at.q_tree).max() <= 1e-9
         assert np.abs(velocity - v).max() <= 1e-9 * max(1.0, np.abs(v).max())
         assert np.abs(ivp.mechanism.kinematics(q_tree).phi).max() <= ivp.mechanism.tolerance
@@ -160,7 +160,7 @@ def test_next_to_a_loss_of_rank_too():
         y = np.concatenate([np.full(mechanism.n, 0.0), random.standard_normal(mechanism.n)])
         y[: mechanism.n] = ready.start.at.q_tree * (flat / ready.start.at.q_tree[0])
         y[: mechanism.n] += 1e-2 * flat * random.standard_normal(mechanism.n)
-        q_tree, _ = ready.loop.on_closure(0.0, y)
+        q_tree, _ = ready.loop.project(0.0, y)
         assert np.abs(mechanism.kinematics(q_tree).phi).max() <= mechanism.tolerance
         assert np.abs(q_tree - y[: mechanism.n]).max() <= 10 * flat
 
@@ -176,11 +176,11 @@ def test_rates_on_the_closure(flat):
     for y in start + off * random.standard_normal((20, len(start))):
         at, v = _closed(mechanism, y, lambda q_tree: np.eye(n))
         wanted = dae_acceleration(Terms(mechanism, at, v), np.zeros(n))
-        found = ready.loop.rate_on_closure(0.0, y)
+        found = ready.loop.rate_on_manifold(0.0, y)
         assert np.abs(found[n:] - wanted).max() <= (1e-11 if flat is None else 1e-12 / flat**2) * np.abs(wanted).max()
 
 
 def test_what_cannot_be_put_on_the_closure_has_no_rate():
     loop = started("five_bar/swing", {"formulation": "dae"}).loop
-    assert loop.rate_on_closure(0.0, loop.y) is not None
-    assert loop.rate_on_closure(0.0, np.append(np.zeros(4), loop.y[4:])) is None  # stretched: J has lost rank
+    assert loop.rate_on_manifold(0.0, loop.y) is not None
+    assert loop.rate_on_manifold(0.0, np.append(np.zeros(4), loop.y[4:])) is None  # stretched: J has lost rank

@@ -122,4 +122,4 @@ def test_numbers_that_are_none_are_refused(bad):
 def test_partitions_that_are_none_are_refused(q, z, says):
     core = _core.Core(core_table(load("five_bar")))
     with pytest.raises(ValueError, match=says):
-        core.split(q, z)
+        core.set_partition(q, z)

@@ -13,6 +13,7 @@ from sksundae.ida import IDA
 
 from ckc_pin import Run, load, simulate
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.native._core import StopReason
 from ckc_pin.run.ivp import Dae, as_ivp
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.initial import Start
@@ -84,7 +85,7 @@ def test_baumgarte_residual_decays_critically_damped() -> None:
     q_tree = ready.start.at.q_tree + np.array([1e-4, 0.0, 0.0, 0.0])
     at = ready.mechanism.kinematics(q_tree)
     ready.begin(Start(at, np.zeros(2), np.zeros(2), np.zeros(4)))
-    assert ready.loop.advance(until=0.3, final=True, pause=math.inf, budget=math.inf)[0] == "end"
+    assert ready.loop.advance(0.3, final=True, pause=math.inf, budget=math.inf).reason == StopReason.END
     decayed = at.phi * (1 + 5.0 * 0.3) * np.exp(-5.0 * 0.3)
     np.testing.assert_allclose(FIVE_BAR.phi(ready.loop.y[:4]), decayed, rtol=0, atol=1e-9)
 

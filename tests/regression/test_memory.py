@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Simulator, load_scene
+from ckc_pin.native._core import StopReason
 from ckc_pin.run.prepare import prepare
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -31,13 +32,16 @@ def test_memory_does_not_grow_with_steps(name: str) -> None:
     ready.begin()
     rows = np.empty((2, ready.loop.width))
     ready.loop.record(np.array([ready.scene.spec.t_end]), rows)
+
+    def advance() -> StopReason:
+        return ready.loop.advance(ready.scene.spec.t_end, final=True, pause=0.0, budget=60.0).reason  # after each step
+
     sizes, count = np.zeros(1000), 0  # allocated before, so that measuring needs no memory
     gc.collect()
     gc.freeze()  # so that objects of other tests are not examined each time
     tracemalloc.start()
     try:
-        # A pause of zero returns after each step.
-        while ready.loop.advance(until=ready.scene.spec.t_end, final=True, pause=0.0, budget=60.0)[0] == "pause":
+        while advance() == StopReason.PAUSE:
             if count % 20 == 0:
                 gc.collect()
                 sizes[count // 20] = tracemalloc.get_traced_memory()[0]

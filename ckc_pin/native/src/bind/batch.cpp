@@ -23,15 +23,11 @@ namespace {
 using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>;
 
-constexpr const char* parameter_names[] = {"gravity",    "offset",        "mass",        "centre",  "inertia",
-                                           "armature",   "point",         "length",      "affine",  "affine_offset",
-                                           "end",        "stiffness",     "rest_length", "damping", "joint_stiffness",
-                                           "joint_rest", "joint_damping", "constant",    "written"};
 constexpr std::int64_t not_started = -1;
 constexpr double pause = 0.05;  // s, until a worker notices that it should stop
 
 struct ParameterColumns {
-  Core::Parameter part;
+  Core::Parameter kind;
   Numbers numbers;  // one row per member
 };
 
@@ -55,13 +51,6 @@ struct Task {
   std::int64_t members;
 };
 
-Core::Parameter parameter_from_name(const std::string& name) {
-  const auto found = std::find_if(std::begin(parameter_names), std::end(parameter_names),
-                                  [&](const char* part) { return name == part; });
-  require(found != std::end(parameter_names), "varied: no " + name);
-  return static_cast<Core::Parameter>(found - std::begin(parameter_names));
-}
-
 void require_shape(const Numbers& x, std::initializer_list<Eigen::Index> shape, const char* what) {
   bool fits = x.ndim() == shape.size();
   size_t k = 0;
@@ -80,7 +69,7 @@ class Batch {
       auto worker = std::make_unique<Worker>();
       prepare(worker->loop, core, formulation, control, solver, events);
       Core& own = *worker->loop.core;
-      require(own.tree.roots.empty(), "a batch is of joints of one freedom");
+      require(own.tree.roots.empty(), "batch: joints with one degree of freedom are needed");
       worker->q = own.q, worker->z = own.z;
       worker->closure_solver = std::make_unique<ClosureSolver>(own);
       worker->v_tree.setZero(own.n), worker->w.setZero(own.constraints.closure.rows);
@@ -113,15 +102,14 @@ class Batch {
     require_shape(task.kept, {M, static_cast<Eigen::Index>(columns.size()), instants.size()}, "kept");
     require_shape(task.met, {M, static_cast<Eigen::Index>(events_)}, "met");
     for (const Counts* x : {&task.why, &task.filled})
-      require(x->size() == static_cast<size_t>(M), "out: a number a member");
-    require(task.work.size() == static_cast<size_t>(3 * M), "work: three numbers a member");
+      require(x->size() == static_cast<size_t>(M), "out: one number per member is needed");
+    require(task.work.size() == static_cast<size_t>(3 * M), "work: three numbers per member are needed");
     require_indices(columns, static_cast<int>(width), "columns");
     for (nb::handle row : parameter_columns) {
       const auto pair = nb::cast<nb::tuple>(row);
-      const Core::Parameter part = parameter_from_name(nb::cast<std::string>(pair[0]));
-      task.parameter_columns.push_back({part, nb::cast<Numbers>(pair[1])});
-      require_shape(task.parameter_columns.back().numbers, {M, core.parameter_size(part)},
-                    parameter_names[static_cast<int>(part)]);
+      const auto kind = nb::cast<Core::Parameter>(pair[0]);
+      task.parameter_columns.push_back({kind, nb::cast<Numbers>(pair[1])});
+      require_shape(task.parameter_columns.back().numbers, {M, core.parameter_size(kind)}, "parameters");
     }
     work(task);
   }
@@ -173,8 +161,8 @@ class Batch {
     const auto row = [k](const Numbers& x, Eigen::Index size) { return Eigen::Map<Vector>(x.data() + k * size, size); };
     task.why.data()[k] = not_started;
     for (const ParameterColumns& parameter_columns : task.parameter_columns)
-      core.set_parameters(parameter_columns.part,
-                          row(parameter_columns.numbers, core.parameter_size(parameter_columns.part)));
+      core.set_parameters(parameter_columns.kind,
+                          row(parameter_columns.numbers, core.parameter_size(parameter_columns.kind)));
     core.set_partition(worker.q, worker.z);
     ClosureSolver& closure_solver = *worker.closure_solver;  // static projection: w and the initial velocity are zero
     if (!closure_solver.project(task.base, worker.w, tolerance_) ||
@@ -221,13 +209,19 @@ class Batch {
 }  // namespace
 
 void bind_batch(nb::module_& m) {
-  nb::list names;
-  for (int k = 0; k < static_cast<int>(Stop::exception) + 1; ++k) names.append(stop_reasons[k]);
-  m.attr("reasons") = nb::tuple(names);
-  nb::class_<Batch>(m, "Batch")
+  nb::class_<Batch>(m, "Batch", "Simulates the members of an ensemble in threads.")
       .def(nb::init<const nb::dict&, const nb::dict&, const nb::dict&, const nb::dict&, const nb::list&, double, int>(),
-           "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a, "tolerance"_a, "threads"_a)
-      .def("run", &Batch::run, "base"_a, "q"_a, "q_dot"_a, "varied"_a, "instants"_a, "columns"_a, "until"_a, "out"_a);
+           "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a, nb::kw_only(), "tolerance"_a, "threads"_a,
+           nb::sig("def __init__(self, core: dict[str, typing.Any], formulation: dict[str, typing.Any], "
+                   "control: dict[str, typing.Any], solver: dict[str, typing.Any], events: list[Event], *, "
+                   "tolerance: float, threads: int) -> None"))
+      .def("run", &Batch::run, "base"_a, "q"_a, "q_dot"_a, nb::kw_only(), "parameters"_a, "instants"_a, "columns"_a,
+           "until"_a, "out"_a,
+           nb::sig("def run(self, base: numpy.typing.NDArray[numpy.float64], q: numpy.typing.NDArray[numpy.float64], "
+                   "q_dot: numpy.typing.NDArray[numpy.float64], *, parameters: list[tuple[CoreParameter, "
+                   "numpy.typing.NDArray[numpy.float64]]], instants: numpy.typing.NDArray[numpy.float64], "
+                   "columns: list[int], until: float, out: dict[str, numpy.typing.NDArray[typing.Any]]) -> None"),
+           "Simulate members, one row each, and write the results to the arrays of `out`.");
 }
 
 }  // namespace ckc

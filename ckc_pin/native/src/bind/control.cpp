@@ -33,8 +33,8 @@ std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int siz
   }
   require(kind == "point", "desired: harmonics, spline or point");
   PointTrajectory::Task task{
-      model_from_table(table),    get<Indices>(table, "place"), closure_from_table(get<nb::dict>(table, "closure")),
-      get<Indices>(table, "psi"), get<Indices>(table, "axis"),  get<Vector>(table, "level")};
+      model_from_table(table),    get<Indices>(table, "q_index"), closure_from_table(get<nb::dict>(table, "closure")),
+      get<Indices>(table, "psi"), get<Indices>(table, "axis"),    get<Vector>(table, "level")};
   const auto n = task.psi.size();
   require(task.axis.size() == n && task.level.size() == static_cast<Eigen::Index>(n), "point: rows of one length");
   require_indices(task.psi, task.closure.rows, "psi");
@@ -117,14 +117,14 @@ std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const C
                                                   const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
   if (kind == "call")
-    return std::make_unique<CallbackController>(nb::object(table["function"]), get<bool>(table, "of_motors"),
-                                                get<bool>(table, "differs"), view);
+    return std::make_unique<CallbackController>(nb::object(table["function"]), get<bool>(table, "outputs_torques"),
+                                                get<bool>(table, "differentiates"), view);
   if (kind == "torques") {
     const auto times = get<Vector>(table, "times");
     const auto tau = get<Matrix>(table, "tau");
     require(times.size() > 0 && times.allFinite(), "torques: a time is needed");
     require(tau.cols() == times.size() && tau.rows() == motors && tau.allFinite(), "torques: a finite column a time");
-    return std::make_unique<TorqueTable>(times, tau, get<bool>(table, "lines"));
+    return std::make_unique<TorqueTable>(times, tau, get<bool>(table, "interpolates"));
   }
   const int d = core.d;
   if (kind == "set_point") {
@@ -183,14 +183,14 @@ nb::object View::term(long stamp, const std::string& name) {
 namespace {
 
 Actuation actuation_from_table(const nb::dict& table, const Core& core) {
-  const auto turns = get<Matrix>(table, "turns");
+  const auto turns = get<Matrix>(table, "transmission");
   const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
              preload = get<Vector>(table, "preload");
   const auto m = turns.rows();
-  require(turns.cols() == core.n && turns.allFinite(), "turns: a finite column a coordinate is needed");
-  require(limit.size() == m && (limit.array() >= 0).all(), "limit: a positive number each");
+  require(turns.cols() == core.n && turns.allFinite(), "transmission: a finite column per coordinate is needed");
+  require(limit.size() == m && (limit.array() >= 0).all(), "limit: positive numbers are needed");
   require(weights, m, "weights"), require(preload, m, "preload");
-  require((weights.array() > 0).all(), "weights: a positive number each");
+  require((weights.array() > 0).all(), "weights: positive numbers are needed");
   std::vector<std::vector<Actuation::Gear>> gears(m);
   for (Eigen::Index k = 0; k < m; ++k)
     for (int j = 0; j < core.n; ++j)
@@ -205,7 +205,7 @@ Sensor sensor_from_table(const nb::dict& table, const Core& core) {
   sensor.q_noise = get<Vector>(table, "q_noise"), sensor.q_dot_noise = get<Vector>(table, "q_dot_noise");
   require(sensor.resolution, core.d, "resolution");
   require(sensor.q_noise, core.d, "q_noise"), require(sensor.q_dot_noise, core.d, "q_dot_noise");
-  sensor.differentiates = get<bool>(table, "differences"), sensor.smoothing = get<double>(table, "smoothing");
+  sensor.differentiates = get<bool>(table, "differentiates"), sensor.smoothing = get<double>(table, "smoothing");
   sensor.seed = get<std::uint64_t>(table, "seed");
   if (table.contains("observer")) sensor.observer = core_from_table(get<nb::dict>(table, "observer"));
   return sensor;
@@ -222,7 +222,7 @@ std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& c
     const auto clock = get<nb::dict>(table, "clock");
     Sampling& sampling = control->sampling.emplace();
     sampling.period = get<double>(clock, "period"), sampling.delay = get<double>(clock, "delay");
-    sampling.times = get<Vector>(clock, "times"), sampling.holds_output = get<bool>(clock, "holds");
+    sampling.times = get<Vector>(clock, "times"), sampling.holds_output = get<bool>(clock, "holds_output");
   }
   if (table.contains("sensor")) control->sensor = sensor_from_table(get<nb::dict>(table, "sensor"), core);
   if (table.contains("drive")) {

@@ -99,13 +99,13 @@ std::unique_ptr<CompiledTerms> compiled_terms_from(const nb::tuple& library) {
 std::unique_ptr<Core> core_from_table(const nb::dict& table) {
   auto core = std::make_unique<Core>(CoreTable{
       model_from_table(table),
-      get<Indices>(table, "place"),
+      get<Indices>(table, "q_index"),
       closure_from_table(get<nb::dict>(table, "closure")),
       springs_from_table(get<nb::dict>(table, "springs")),
       joints_from_table(get<nb::dict>(table, "joints")),
       get<int>(table, "rank"),
       {get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")},
-      table.contains("written") ? compiled_terms_from(get<nb::tuple>(table, "written")) : nullptr,
+      table.contains("compiled") ? compiled_terms_from(get<nb::tuple>(table, "compiled")) : nullptr,
   });
   require(core->scales.rows, core->constraints.closure.rows, "row_scale");
   require(core->scales.columns, core->n, "column_scale");
@@ -118,11 +118,11 @@ std::unique_ptr<Core> core_from_table(const nb::dict& table) {
 namespace {
 
 // Return all terms at one state, for comparisons.
-nb::dict terms(Core& core, Given q_tree, Given v_tree) {
+nb::typed<nb::dict, nb::str, Matrix> terms(Core& core, Given q_tree, Given v_tree) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   core.set_configuration(q_tree), core.compute_D(), core.set_velocity(v_tree), core.compute_bias(),
       core.compute_coriolis();
-  nb::dict found;
+  nb::typed<nb::dict, nb::str, Matrix> found;
   for (const char* name : {"phi", "J", "rho", "D_tree", "D", "bias_tree", "C_tree", "h_tree", "C", "rho_dot", "h"})
     found[name] = term_by_name(core, name);
   found["J_dot_v"] = core.J_dot_v, found["J_dot"] = core.constraints.J_dot;
@@ -196,19 +196,22 @@ nb::object term_by_name(Core& core, const std::string& name) {
 }
 
 void bind_core(nb::module_& m) {
-  nb::class_<Core>(m, "Core")
-      .def(nb::new_(&core_from_table), "table"_a)
+  nb::class_<Core>(m, "Core", "The terms of a mechanism at one state.")
+      .def(nb::new_([](const nb::typed<nb::dict, nb::str, nb::any>& table) { return core_from_table(table); }),
+           "table"_a)
       .def(
-          "split",
+          "set_partition",
           [](Core& core, const Indices& q, const Indices& z) {
             require_partition(core, q, z);
             core.set_partition(q, z);
           },
           "q"_a, "z"_a)
-      .def("jacobian", &jacobian, "q_tree"_a)
-      .def("terms", &terms, "q_tree"_a, "v_tree"_a)
-      .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a)
-      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a);
+      .def("jacobian", &jacobian, "q_tree"_a, "Return J.")
+      .def("terms", &terms, "q_tree"_a, "v_tree"_a, "Return the terms of eqs. 1 and 6 at a state, by name.")
+      .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a,
+           "Return q_ddot of eq. 6, with C at v' = rho q_dot or, if `actual`, at v_tree.")
+      .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a,
+           "Return the acceleration of eq. 1, NaN if J has lost rank; `correction` is added to J_dot v'.");
 }
 
 }  // namespace ckc

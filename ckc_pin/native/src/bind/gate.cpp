@@ -25,28 +25,29 @@ struct Turn {
 }  // namespace
 
 void bind_gate(nb::module_& m) {
-  nb::class_<Turn>(m, "Turn")
+  nb::class_<Turn>(m, "Turn", "Holds a gate's lock within a `with` block.")
       .def("__enter__",
            [](Turn& turn) {
              if (!turn.locked->test_and_set()) return;
              PyErr_SetString(turn.exception_type.ptr(), turn.message.c_str());
              throw nb::python_error();
            })
-      .def("__exit__", [](Turn& turn, const nb::args&) { turn.locked->clear(); });
-  nb::class_<Gate>(m, "Gate")
+      .def(
+          "__exit__", [](Turn& turn, const nb::args&) { turn.locked->clear(); },
+          nb::sig("def __exit__(self, *args: object) -> None"));
+  nb::class_<Gate>(m, "Gate", "A lock that admits one call at a time; a second one raises an exception.")
       .def(
           "__init__",
           [](Gate* self, nb::object exception_type) {
             new (self) Gate, self->exception_type = std::move(exception_type);
           },
-          "refusal"_a)
-      // `message`: of the exception that a refused call raises.
+          "exception_type"_a, nb::sig("def __init__(self, exception_type: type[Exception]) -> None"))
       .def(
           "turn",
           [](const Gate& gate, std::string message) {
             return Turn{gate.locked, gate.exception_type, std::move(message)};
           },
-          "says"_a);
+          "message"_a, "Return a context manager; `message` is that of the exception raised when the lock is taken.");
 }
 
 }  // namespace ckc

@@ -1,6 +1,7 @@
 // Bindings of the linearization of a mechanism, and of a controller's derivatives.
 #include <chrono>
 
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/unique_ptr.h>
 
 #include "bind/control.hpp"
@@ -12,9 +13,11 @@ using namespace nb::literals;
 
 namespace {
 
-std::unique_ptr<Linearization> linearization_from_table(const nb::dict& table, const Matrix& transmission) {
+std::unique_ptr<Linearization> linearization_from_table(const nb::typed<nb::dict, nb::str, nb::any>& table,
+                                                        const Matrix& transmission) {
   auto core = core_from_table(table);
-  require(transmission.cols() == core->n && transmission.allFinite(), "turns: a finite column a coordinate is needed");
+  require(transmission.cols() == core->n && transmission.allFinite(),
+          "transmission: a finite column per coordinate is needed");
   return std::make_unique<Linearization>(std::move(core), transmission);
 }
 
@@ -25,11 +28,12 @@ void require_state(const Linearization& linearization, In q_tree, In v_tree, In 
 }
 
 // Return the linearization at one state; None if J has lost rank.
-nb::object at(Linearization& linearization, Given q_tree, Given v_tree, Given u_tree, const Indices& locked) {
+std::optional<nb::typed<nb::dict, nb::str, nb::any>> at(Linearization& linearization, Given q_tree, Given v_tree,
+                                                        Given u_tree, const Indices& locked) {
   require_state(linearization, q_tree, v_tree, u_tree, locked);
-  if (!linearization.compute(q_tree, v_tree, u_tree, locked)) return nb::none();
+  if (!linearization.compute(q_tree, v_tree, u_tree, locked)) return {};
   linearization.solve_multipliers();
-  nb::dict result;
+  nb::typed<nb::dict, nb::str, nb::any> result;
   result["at"] = linearization.at, result["T"] = linearization.T, result["V"] = linearization.V,
   result["A"] = linearization.A, result["B"] = linearization.B;
   result["acceleration"] = linearization.acceleration.a, result["a_q"] = linearization.acceleration.by_q,
@@ -81,13 +85,19 @@ class Feedback {
 }  // namespace
 
 void bind_linearization(nb::module_& m) {
-  nb::class_<Linearization>(m, "Plant")
-      .def(nb::new_(&linearization_from_table), "core"_a, "turns"_a)
+  nb::class_<Linearization>(m, "Linearization", "Linearizes eq. 1 at one state after another.")
+      .def(nb::new_(&linearization_from_table), "core"_a, "transmission"_a)
       .def("at", &at, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a)
       .def("seconds", &seconds, "q_tree"_a, "v_tree"_a, "u_tree"_a, "rounds"_a);
-  nb::class_<Feedback>(m, "Feedback")
-      .def(nb::init<const nb::dict&, const nb::dict&>(), "core"_a, "control"_a)
-      .def("at", &Feedback::at, "t"_a, "q_tree"_a, "v_tree"_a);
+  nb::class_<Feedback>(m, "Feedback", "A controller with its motors, evaluated and differentiated at one state.")
+      .def(nb::init<const nb::dict&, const nb::dict&>(), "core"_a, "control"_a,
+           nb::sig("def __init__(self, core: dict[str, typing.Any], control: dict[str, typing.Any]) -> None"))
+      .def("at", &Feedback::at, "t"_a, "q_tree"_a, "v_tree"_a,
+           nb::sig("def at(self, t: float, q_tree: numpy.typing.NDArray[numpy.float64], v_tree: "
+                   "numpy.typing.NDArray[numpy.float64]) -> tuple[numpy.typing.NDArray[numpy.float64], "
+                   "numpy.typing.NDArray[numpy.float64], numpy.typing.NDArray[numpy.float64]] | str | None"),
+           "Return the force on the tree and its derivatives by q' and v'; a reason if there is no force; None if the "
+           "derivatives are unknown.");
 }
 
 }  // namespace ckc

@@ -13,25 +13,19 @@ namespace ckc {
 
 using namespace nb::literals;
 
-const char* const stop_reasons[] = {"end",      "event",  "pause",   "rhs_budget", "wall_budget", "pace",
-                                    "min_step", "step",   "rank",    "chart",      "energy",      "control",
-                                    "function", "output", "chatter", "contact",    "beyond_stop", "raised"};
-
 namespace {
 
 using RecordArray = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
-constexpr const char* transition_kinds[] = {"sticks", "slides", "touches", "leaves", "bounces"};
-constexpr const char* rhs_failures[] = {"none", "open", "rank", "infinite", "control", "vague", "shares", "pole"};
 constexpr const char* method_names[] = {"DOP853", "RK45", "Radau"};
 
 // Build the formulation, extended by sensitivities if its table has them; `sensitivities` then receives their results.
 template <class Formulation, class... Arguments>
 std::unique_ptr<System> with_sensitivities(const nb::dict& table, SensitivityResults*& sensitivities,
                                            Arguments&&... arguments) {
-  if (!table.contains("variation")) return std::make_unique<Formulation>(std::forward<Arguments>(arguments)...);
+  if (!table.contains("sensitivities")) return std::make_unique<Formulation>(std::forward<Arguments>(arguments)...);
   auto system = std::make_unique<SensitivitySystem<Formulation>>(
-      sensitivity_table(nb::cast<nb::dict>(table["variation"])), std::forward<Arguments>(arguments)...);
+      sensitivity_table(nb::cast<nb::dict>(table["sensitivities"])), std::forward<Arguments>(arguments)...);
   sensitivities = system.get();
   return system;
 }
@@ -45,7 +39,7 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
     const double alpha = get<double>(table, "alpha"), beta = get<double>(table, "beta");
     require(alpha >= 0 && beta >= 0, "alpha and beta: numbers that are not negative are needed");
     const bool projects = get<bool>(table, "projects");
-    require(!table.contains("variation") || (projects && alpha == 0 && beta == 0),
+    require(!table.contains("sensitivities") || (projects && alpha == 0 && beta == 0),
             "sensitivities: the DAE must be projected onto the constraint manifold");
     return with_sensitivities<Dae>(table, sensitivities, core, control, tolerance, projects, alpha, beta);
   }
@@ -54,27 +48,17 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
   require(epsilon > 0, "epsilon: a positive number is needed");
   if (kind == "level_set")
     return with_sensitivities<LevelSet>(table, sensitivities, core, control, epsilon, actual, tolerance,
-                                        get<double>(table, "slack"));
+                                        get<double>(table, "rhs_slack"));
   require(kind == "printed", "formulation: dae, level_set or printed");
   require(core.tree.roots.empty(), "eq. 8 as printed: trees with free roots are not supported");
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
 
-// (of, coordinate, value, sign, direction, stop, floor, function or None)
-Event event_from_row(const nb::tuple& row, const Core& core, const std::shared_ptr<View>& view) {
-  const int of = nb::cast<int>(row[0]), coordinate = nb::cast<int>(row[1]);
-  require(of >= Event::q && of <= Event::function, "event: of what?");
-  require_indices({coordinate}, core.n, "event");
-  Event event{static_cast<Event::Quantity>(of),
-              coordinate,
-              nb::cast<double>(row[2]),
-              nb::cast<double>(row[3]),
-              nb::cast<int>(row[4]),
-              nb::cast<bool>(row[5]),
-              nb::cast<double>(row[6]),
-              {}};
+Event event_from_table(const EventTable& table, const Core& core, const std::shared_ptr<View>& view) {
+  Event event = table.event;
+  require_indices({event.coordinate}, core.n, "event");
   if (event.quantity != Event::function) return event;
-  auto function = std::make_shared<nb::object>(row[7]);
+  auto function = std::make_shared<nb::object>(table.function);
   event.evaluate = [function, view](double t, System& system, double& value) {
     nb::object answer;
     ControlFailure& failure = system.control.failure;
@@ -97,13 +81,15 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   loop.core = core_from_table(core);
   auto acting = control_from_table(control, *loop.core, loop.view);
   auto system = system_from_table(*loop.core, *acting, formulation, loop.sensitivities);
-  const Options options{get<std::string>(solver, "method"), get<double>(solver, "rtol"),
-                        get<double>(solver, "atol"),        get<double>(solver, "max_step"),
-                        get<double>(solver, "min_step"),    get<long>(solver, "max_rhs"),
-                        get<double>(solver, "closed")};
-  require(options.rtol > 0 && options.atol > 0 && options.max_step > 0, "tolerances must be positive");
+  const Options options{
+      get<std::string>(solver, "method"),       get<double>(solver, "rtol"),     get<double>(solver, "atol"),
+      get<double>(solver, "max_step"),          get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
+      get<double>(solver, "manifold_tolerance")};
+  require(options.rtol > 0 && options.atol > 0 && options.max_step > 0,
+          "rtol, atol and max_step: positive numbers are needed");
   std::vector<Event> functions;
-  for (const auto& row : events) functions.push_back(event_from_row(nb::cast<nb::tuple>(row), *loop.core, loop.view));
+  for (nb::handle event : events)
+    functions.push_back(event_from_table(nb::cast<const EventTable&>(event), *loop.core, loop.view));
   loop.core->profile.on = get<bool>(solver, "profile");
   loop.step_loop = std::make_unique<StepLoop>(std::move(acting), std::move(system), options, std::move(functions));
 }
@@ -134,13 +120,13 @@ void use_compiled_terms(Loop& loop, const nb::tuple& library) {
 
 void record(Loop& loop, Given instants, RecordArray rows) {
   require(instants, instants.size(), "instants");
-  require(rows.shape(1) == static_cast<size_t>(loop.step_loop->recorder.width), "rows: another width");
+  require(rows.shape(1) == static_cast<size_t>(loop.step_loop->recorder.width),
+          "rows: an array with a column per recorded number is needed");
   loop.rows = nb::cast(rows);
   loop.step_loop->record(instants, rows.data(), static_cast<Eigen::Index>(rows.shape(0)));
 }
 
-// (why, t, value, event, filled rows)
-nb::object advance(Loop& loop, double until, bool final, double pause, double budget) {
+Stop advance(Loop& loop, double until, bool final, double pause, double budget) {
   Stop stop;
   {
     nb::gil_scoped_release released;
@@ -150,14 +136,14 @@ nb::object advance(Loop& loop, double until, bool final, double pause, double bu
     loop.step_loop->control->failure = {};
     std::rethrow_exception(std::exchange(loop.view->raised, nullptr));
   }
-  return nb::make_tuple(stop_reasons[stop.reason], stop.t, stop.value, stop.which, loop.step_loop->recorder.filled);
+  return stop;
 }
 
-bool set_control(Loop& loop, nb::handle u, bool of_motors) {
-  Vector constant(of_motors ? loop.step_loop->control->tau.size() : loop.core->d);
+bool set_control(Loop& loop, nb::handle u, bool torques) {
+  Vector constant(torques ? loop.step_loop->control->tau.size() : loop.core->d);
   require(read(u, constant), "u: an array of d doubles is needed, or of one for each motor");
   if (!finite(constant)) return false;
-  loop.step_loop->set_control(constant, of_motors);
+  loop.step_loop->set_control(constant, torques);
   return true;
 }
 
@@ -177,79 +163,69 @@ nb::object state(Loop& loop) {
 }
 
 // Hold u or torques and advance. Return the stop and the state; None if a number is not finite.
-nb::object step(Loop& loop, nb::handle u, bool of_motors, double until, double pause) {
-  if (!set_control(loop, u, of_motors)) return nb::none();
-  nb::object stop = advance(loop, until, false, pause, std::numeric_limits<double>::infinity());
-  return nb::make_tuple(std::move(stop), state(loop));
+nb::object step(Loop& loop, nb::handle u, double until, double pause, bool torques) {
+  if (!set_control(loop, u, torques)) return nb::none();
+  const Stop stop = advance(loop, until, false, pause, std::numeric_limits<double>::infinity());
+  return nb::make_tuple(stop, state(loop));
 }
 
 // Explain why no step could be made.
-nb::tuple failure(Loop& loop) {
+StepFailure failure(Loop& loop) {
   StepLoop& step_loop = *loop.step_loop;
-  const ControlFailure& failure = step_loop.control->failure;
-  const std::string why = rhs_failures[static_cast<int>(step_loop.system->failure)], says = failure.message;
-  const Vector u = failure.u;
-  const bool is_known = step_loop.sync_core(),
-             of_q = step_loop.control->needs_fixed_partition() || std::isfinite(step_loop.system->coordinate_margin());
-  const double margin = is_known && of_q ? step_loop.system->phi_z_margin() : std::nan("");
-  const double size = is_known ? loop.core->constraints.J.norm() : std::nan("");
-  return nb::make_tuple(why, says, u, margin * size, margin, Vector(loop.core->q_tree), loop.core->q, loop.core->z);
+  StepFailure failure{step_loop.system->failure,
+                      step_loop.control->failure.message,
+                      step_loop.control->failure.u,
+                      std::nan(""),
+                      std::nan(""),
+                      {},
+                      {},
+                      {}};
+  if (step_loop.sync_core()) {
+    if (step_loop.control->needs_fixed_partition() || std::isfinite(step_loop.system->coordinate_margin()))
+      failure.margin = step_loop.system->phi_z_margin();
+    failure.sigma_min = failure.margin * loop.core->constraints.J.norm();
+  }
+  failure.q_tree = loop.core->q_tree, failure.q = loop.core->q, failure.z = loop.core->z;
+  return failure;
 }
 
-nb::dict stats(const Loop& loop) {
+LoopStats stats(const Loop& loop) {
   const StepLoop& step_loop = *loop.step_loop;
   const Counts& counts = step_loop.system->counts;
-  nb::dict found, by_method, by_terms;
-  long steps = 0;
+  const Work& work = step_loop.work;
+  const bool compiled = loop.core->compiled != nullptr;
+  LoopStats stats{};
   for (int k = 0; k < 3; ++k) {
-    steps += step_loop.steps[k];
-    if (step_loop.steps[k]) by_method[method_names[k]] = step_loop.steps[k];
+    stats.steps += step_loop.steps[k];
+    if (step_loop.steps[k]) stats.steps_by_method[method_names[k]] = step_loop.steps[k];
   }
-  found["terms"] = loop.core->compiled ? "generated" : "pinocchio";
-  if (loop.core->compiled) by_terms["generated"] = step_loop.work.rhs - loop.rhs_before_compiled - counts.general_rhs;
-  if (counts.general_rhs) by_terms["general"] = counts.general_rhs;
-  if (loop.rhs_before_compiled || !loop.core->compiled)
-    by_terms["pinocchio"] = loop.core->compiled ? loop.rhs_before_compiled : step_loop.work.rhs;
-  found["rhs_by_terms"] = by_terms;
-  found["rhs"] = step_loop.work.rhs, found["steps"] = steps, found["rejected"] = step_loop.work.rejected;
-  found["newton"] = counts.newton, found["factorizations"] = counts.factorizations + step_loop.work.factorizations;
-  found["jacobians"] = step_loop.work.jacobians, found["differences"] = counts.differences;
-  found["switches"] = counts.switches;
-  found["method"] = step_loop.method() ? step_loop.method()->name() : "";
-  found["steps_by_method"] = by_method, found["python_calls"] = loop.view->calls;
-  return found;
-}
-
-nb::list occurrences(const Loop& loop) {
-  nb::list found;
-  for (const EventOccurrence& occurrence : loop.step_loop->events.occurrences)
-    found.append(nb::make_tuple(occurrence.t, occurrence.event, occurrence.direction));
-  return found;
-}
-
-// Return the transitions of joint modes so far.
-nb::list joint_transitions(const Loop& loop) {
-  nb::list found;
-  for (const JointTransition& transition : loop.core->joints.transitions)
-    found.append(
-        nb::make_tuple(transition.t, transition.coordinate, transition_kinds[transition.kind], transition.direction));
-  return found;
+  stats.terms = compiled ? "generated" : "pinocchio";
+  if (compiled) stats.rhs_by_terms["generated"] = work.rhs - loop.rhs_before_compiled - counts.general_rhs;
+  if (counts.general_rhs) stats.rhs_by_terms["general"] = counts.general_rhs;
+  if (loop.rhs_before_compiled || !compiled)
+    stats.rhs_by_terms["pinocchio"] = compiled ? loop.rhs_before_compiled : work.rhs;
+  stats.rhs = work.rhs, stats.rejected = work.rejected, stats.jacobians = work.jacobians;
+  stats.newton = counts.newton, stats.factorizations = counts.factorizations + work.factorizations;
+  stats.differences = counts.differences, stats.switches = counts.switches;
+  stats.method = step_loop.method() ? step_loop.method()->name() : "";
+  stats.python_calls = loop.view->calls;
+  return stats;
 }
 
 // Return the locked joints with their holding forces and bounds.
-nb::list locked_joints(const Loop& loop) {
-  nb::list locked;
+std::vector<LockedJoint> locked_joints(const Loop& loop) {
+  std::vector<LockedJoint> locked;
   const Joints& joints = loop.core->joints;
   for (size_t i = 0; i < joints.locked.size() && static_cast<Eigen::Index>(i) < joints.holding_forces().size(); ++i) {
     const int k = joints.locked[i];
-    locked.append(nb::make_tuple(k, joints.holding_forces()(static_cast<Eigen::Index>(i)), joints.lower_force(k),
-                                 joints.upper_force(k)));
+    const double force = joints.holding_forces()(static_cast<Eigen::Index>(i));
+    locked.push_back({k, force, joints.lower_force(k), joints.upper_force(k)});
   }
   return locked;
 }
 
-nb::dict profile(const Loop& loop) {
-  nb::dict found;
+nb::typed<nb::dict, nb::str, nb::typed<nb::tuple, int, double>> profile(const Loop& loop) {
+  nb::typed<nb::dict, nb::str, nb::typed<nb::tuple, int, double>> found;
   const Profile& profile = loop.core->profile;
   for (int k = 0; k < Profile::terms; ++k)
     if (profile.calls[k]) found[Profile::names[k]] = nb::make_tuple(profile.calls[k], profile.seconds[k]);
@@ -298,34 +274,70 @@ double seconds(Loop& loop, Table states, int rounds, bool of_jacobian) {
 }  // namespace
 
 void bind_loop(nb::module_& m) {
-  nb::class_<View>(m, "View").def("term", &View::term, "stamp"_a, "name"_a);
-  nb::class_<Loop> binding(m, "Loop");
-  binding.def("__init__", &construct, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a)
-      .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
-      .def("step", &step, "u"_a, "of_motors"_a, "until"_a, "pause"_a)
-      .def("record", &record, "instants"_a, "rows"_a)
-      .def("record_now", [](Loop& loop) { loop.step_loop->record_now(); })
-      .def("write", &use_compiled_terms, "library"_a)
+  nb::class_<View>(m, "View", "The state of the loop during a callback.")
+      .def("term", &View::term, "stamp"_a, "name"_a, nb::sig("def term(self, stamp: int, name: str) -> typing.Any"));
+  bind_types(m);
+  nb::class_<Loop> binding(m, "Loop", "The step loop of a mechanism with its controller, events and record.");
+  binding
+      .def("__init__", &construct, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a,
+           nb::sig("def __init__(self, core: dict[str, typing.Any], formulation: dict[str, typing.Any], "
+                   "control: dict[str, typing.Any], solver: dict[str, typing.Any], events: list[Event]) -> None"))
+      .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a, "Start at a state with phi = w.")
+      .def("advance", &advance, "until"_a, nb::kw_only(), "final"_a, "pause"_a, "budget"_a,
+           "Advance to a time. `final`: the motion ends there; `pause`, `budget`: seconds until the loop returns.")
+      .def("step", &step, "u"_a, "until"_a, "pause"_a, nb::kw_only(), "torques"_a,
+           nb::sig("def step(self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, "
+                   "torques: bool) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], "
+                   "list[int]] | None] | None"),
+           "Hold u, or motor torques, and advance. Return the stop and `state`; None if a number is not finite.")
+      .def("state", &state,
+           nb::sig("def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None"),
+           "Return t, the numbers (q', velocity, v' of the terms, w), q and z of the present state; None if it cannot "
+           "be projected.")
+      .def("record", &record, "instants"_a, "rows"_a, "Record the state at these instants into the rows of an array.")
       .def(
-          "pause_at", [](Loop& loop, long rhs) { loop.step_loop->pause_at = rhs; }, "rhs"_a)
-      .def("advance", &advance, "until"_a, "final"_a, "pause"_a, "budget"_a)
-      .def("state", &state)
-      .def("trouble", &failure)
+          "record_now", [](Loop& loop) { return loop.step_loop->record_now(); },
+          "Record the present state. False if it cannot be evaluated.")
+      .def("use_compiled_terms", &use_compiled_terms, "library"_a,
+           nb::sig("def use_compiled_terms(self, library: tuple[str, numpy.typing.NDArray[numpy.float64]]) -> None"),
+           "Use compiled terms from here on: (path, parameters).")
+      .def(
+          "pause_at", [](Loop& loop, long rhs) { loop.step_loop->pause_at = rhs; }, "rhs"_a,
+          "Let `advance` pause after this many right-hand sides.")
+      .def("failure", &failure, "Explain why no step could be made.")
       .def("stats", &stats)
-      .def("met", &occurrences)
-      .def("joint_changes", &joint_transitions)
-      .def("locked_joints", &locked_joints)
-      .def("forget_met",
-           [](Loop& loop) { loop.step_loop->events.occurrences.clear(), loop.core->joints.transitions.clear(); })
-      .def("crossings", [](const Loop& loop) { return loop.step_loop->crossings; })
-      .def("profile", &profile)
-      .def("rhs", &rhs, "t"_a, "y"_a)
-      .def("jacobian", &jacobian, "t"_a, "y"_a)
-      .def("seconds", &seconds, "states"_a, "rounds"_a, "of_jacobian"_a = false)
+      .def(
+          "occurrences", [](const Loop& loop) { return loop.step_loop->events.occurrences; },
+          "Return the events that have occurred.")
+      .def(
+          "joint_transitions", [](const Loop& loop) { return loop.core->joints.transitions; },
+          "Return the transitions of joint modes.")
+      .def("locked_joints", &locked_joints, "Return the locked joints.")
+      .def(
+          "clear_events",
+          [](Loop& loop) { loop.step_loop->events.occurrences.clear(), loop.core->joints.transitions.clear(); },
+          "Forget the events and transitions so far.")
+      .def(
+          "crossings", [](const Loop& loop) { return loop.step_loop->crossings; }, "Times at which J lost rank.")
+      .def("profile", &profile, "Return evaluations and seconds by term.")
+      .def("rhs", &rhs, "t"_a, "y"_a,
+           nb::sig("def rhs(self, t: float, y: numpy.typing.NDArray[numpy.float64]) -> "
+                   "numpy.typing.NDArray[numpy.float64] | None"),
+           "Return y' at (t, y), with what acts there; None if it does not exist.")
+      .def("jacobian", &jacobian, "t"_a, "y"_a,
+           nb::sig("def jacobian(self, t: float, y: numpy.typing.NDArray[numpy.float64]) -> "
+                   "numpy.typing.NDArray[numpy.float64] | None"))
+      .def("seconds", &seconds, "states"_a, "rounds"_a, nb::kw_only(), "of_jacobian"_a = false,
+           "Return the seconds of a right-hand side, or of its Jacobian, over states: rows of (t, y).")
       .def_prop_ro("t", [](const Loop& loop) { return loop.step_loop->t(); })
       .def_prop_ro("y", [](const Loop& loop) { return Vector(loop.step_loop->y()); })
-      .def_prop_ro("filled", [](const Loop& loop) { return loop.step_loop->recorder.filled; })
-      .def_prop_ro("width", [](const Loop& loop) { return loop.step_loop->recorder.width; });
+      .def_prop_ro(
+          "filled", [](const Loop& loop) { return loop.step_loop->recorder.filled; }, "recorded rows")
+      .def_prop_ro(
+          "width", [](const Loop& loop) { return loop.step_loop->recorder.width; }, "numbers per row")
+      .def_prop_ro(
+          "record_columns", [](const Loop& loop) { return loop.step_loop->recorder.columns; },
+          "where each quantity is in a row");
   bind_parts(m, binding);
   bind_sensitivities(binding);
 }

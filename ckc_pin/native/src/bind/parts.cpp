@@ -1,6 +1,9 @@
 // Bindings of single parts of the core, for tests.
 #include <cmath>
 
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+
 #include "bind/run.hpp"
 #include "tree/rotation.hpp"
 #include "motion/stiffness.hpp"
@@ -13,7 +16,7 @@ namespace {
 
 // Find all sign changes of a function over [start, end] as events do; `exact`: the exact function, if `function` is
 // an approximation.
-nb::tuple sign_changes_of(const nb::callable& function, double start, double end, int sign, double floor,
+nb::tuple sign_changes_of(const nb::callable& function, double start, double end, int sign, double zero_threshold,
                           nb::object exact) {
   const Vector points = sample_points();
   Vector values(points.size());
@@ -23,7 +26,7 @@ nb::tuple sign_changes_of(const nb::callable& function, double start, double end
   const ScalarFunction gap = gap_of(function), better = gap_of(exact);
   for (Eigen::Index k = 0; k < points.size(); ++k) gap(start + (end - start) * points(k), values(k));
   RootSearch search;
-  search.find(gap, {start, end}, values, sign, floor, exact.is_none() ? nullptr : &better);
+  search.find(gap, {start, end}, values, sign, zero_threshold, exact.is_none() ? nullptr : &better);
   nb::list found;
   for (const auto& [t, direction] : search.sign_changes) found.append(nb::make_tuple(t, direction));
   return nb::make_tuple(found, search.sign, search.on_zero);
@@ -35,7 +38,7 @@ struct BoundPredictor {
   Chart chart;
   Predictor predictor;
 
-  BoundPredictor(const nb::dict& table, Given q_tree, double epsilon)
+  BoundPredictor(const nb::typed<nb::dict, nb::str, nb::any>& table, Given q_tree, double epsilon)
       : core(core_from_table(table)), predictor(*core, epsilon) {
     core->set_configuration(q_tree), core->compute_rho();
     chart.reset(*core, q_tree), predictor.reset(*core, q_tree);
@@ -51,14 +54,14 @@ struct BoundPredictor {
   }
 };
 
-nb::tuple weights(const Vector& times, double t) {
+nb::typed<nb::tuple, Vector, Vector> weights(const Vector& times, double t) {
   Vector a(times.size()), b(times.size());
   hermite_weights(times.data(), static_cast<int>(times.size()), t, a.data(), b.data());
   return nb::make_tuple(a, b);
 }
 
 // Return the Jacobian of a rotation vector, its derivative along a, and the derivative of that along b.
-nb::tuple log_rates(const Vector& u, const Vector& a, const Vector& b) {
+nb::typed<nb::tuple, Matrix, Matrix, Matrix> log_jacobian(const Vector& u, const Vector& a, const Vector& b) {
   require(u, 3, "u"), require(a, 3, "a"), require(b, 3, "b");
   const Vector3 direction_a = a, direction_b = b;
   const LogJacobian log{Vector3(u)};
@@ -67,7 +70,7 @@ nb::tuple log_rates(const Vector& u, const Vector& a, const Vector& b) {
 }
 
 // Return the rank monitor's smallest singular value and its rate at a state of a DAE.
-nb::tuple rank(Loop& loop, Given y) {
+nb::typed<nb::tuple, double, double> rank(Loop& loop, Given y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   system.sync_core_at_last_rhs(0.0, y);
@@ -86,46 +89,60 @@ Vector collocate(Loop& loop, double span, int stages) {
   return y;
 }
 
-nb::object rate_on_manifold(Loop& loop, double t, Given y) {
+std::optional<Vector> rate_on_manifold(Loop& loop, double t, Given y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   Vector y_dot(system.size);
-  return system.rate_on_manifold(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
+  return system.rate_on_manifold(t, y, y_dot) ? std::optional(y_dot) : std::nullopt;
 }
 
 // Project (q', v') onto the constraint manifold.
-nb::object on_closure(Loop& loop, double t, Given y) {
+std::optional<std::pair<Vector, Vector>> project(Loop& loop, double t, Given y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
-  if (!system.sync_core(t, y)) return nb::none();
-  return nb::make_tuple(Vector(loop.core->q_tree), Vector(system.velocity));
+  if (!system.sync_core(t, y)) return {};
+  return std::pair(loop.core->q_tree, system.velocity);
 }
 
 // Return the reduced Jacobian that decides about stiffness.
-nb::object modes(Loop& loop, Matrix jacobian) {
+std::optional<Matrix> reduced_jacobian(Loop& loop, Matrix jacobian) {
   const Step& now = loop.step_loop->now;
-  return loop.step_loop->system->reduce_to_freedoms(now.y, jacobian) ? nb::cast(jacobian) : nb::none();
+  return loop.step_loop->system->reduce_to_freedoms(now.y, jacobian) ? std::optional(jacobian) : std::nullopt;
 }
 
 }  // namespace
 
 void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
-  m.def("walk", &sign_changes_of, "function"_a, "start"_a, "end"_a, "sign"_a, "floor"_a, "exact"_a.none() = nb::none());
-  m.def("stiff", &is_stiff, "jacobian"_a, "duration"_a);
-  m.def("log_rates", &log_rates, "u"_a, "a"_a, "b"_a);
-  m.def("hermite_weights", &weights, "times"_a, "t"_a);
-  nb::class_<BoundPredictor>(m, "Predictor")
-      .def(nb::init<const nb::dict&, Given, double>(), "core"_a, "q_tree"_a, "epsilon"_a)
+  m.def(
+      "find_sign_changes", &sign_changes_of, "function"_a, "start"_a, "end"_a, nb::kw_only(), "sign"_a = 0,
+      "zero_threshold"_a = 0.0, "exact"_a.none() = nb::none(),
+      nb::sig("def find_sign_changes(function: collections.abc.Callable[[float], float], start: float, end: float, *, "
+              "sign: int = 0, zero_threshold: float = 0.0, exact: collections.abc.Callable[[float], float] | None = "
+              "None) -> tuple[list[tuple[float, int]], int, bool]"),
+      "Find the sign changes of a function as events do: ([(t, direction)], last sign, whether it ends on zero).");
+  m.def("is_stiff", &is_stiff, "jacobian"_a, "duration"_a, "Decide whether a linear system of this duration is stiff.");
+  m.def("log_jacobian", &log_jacobian, "u"_a, "a"_a, "b"_a,
+        "Return the Jacobian of a rotation vector, its derivative along a, and that one's derivative along b.");
+  m.def("hermite_weights", &weights, "times"_a, "t"_a,
+        "Return the weights of values and of derivatives of Hermite interpolation.");
+  nb::class_<BoundPredictor>(m, "Predictor", "Extrapolates the configuration as a starting point of the projection.")
+      .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&, Given, double>(), "core"_a, "q_tree"_a, "epsilon"_a)
       .def("add", &BoundPredictor::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("predict", &BoundPredictor::predict, "t"_a, "numbers"_a, "w"_a);
-  binding.def("rank", &rank, "y"_a)
-      .def("modes", &modes, "jacobian"_a)
-      .def("collocate", &collocate, "span"_a, "stages"_a)
-      .def("rate_on_closure", &rate_on_manifold, "t"_a, "y"_a)
-      .def("on_closure", &on_closure, "t"_a, "y"_a)
+  binding
+      .def("rank", &rank, "y"_a,
+           "Return the rank monitor's smallest singular value of J and its rate at a DAE's state.")
+      .def("reduced_jacobian", &reduced_jacobian, "jacobian"_a,
+           "Return the Jacobian in minimal coordinates, whose eigenvalues decide about stiffness.")
+      .def("collocate", &collocate, "span"_a, "stages"_a,
+           "Return the end of one collocation step from the present state.")
+      .def("rate_on_manifold", &rate_on_manifold, "t"_a, "y"_a,
+           "Project a state onto the constraint manifold and return its rate; None if there is none.")
+      .def("project", &project, "t"_a, "y"_a,
+           "Return (q', v') of a state projected onto the constraint manifold; None if that fails.")
       .def_prop_rw(  // of the next step; 0 lets the method estimate it
-          "length", [](const Loop& loop) { return loop.step_loop->now.h; },
-          [](Loop& loop, double length) { loop.step_loop->now.h = length; })
+          "step_size", [](const Loop& loop) { return loop.step_loop->now.h; },
+          [](Loop& loop, double step_size) { loop.step_loop->now.h = step_size; })
       .def_prop_rw(
           "newton_tolerance", [](const Loop& loop) { return loop.step_loop->newton_tolerance(); },
           [](Loop& loop, double tolerance) { loop.step_loop->newton_tolerance() = tolerance; });

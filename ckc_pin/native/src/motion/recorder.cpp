@@ -5,13 +5,37 @@
 
 namespace ckc {
 
-static int row_width(const System& system) {
+// The same order as in `fill_row`.
+static std::vector<RecordColumns> columns_of(const System& system) {
   const Core& core = system.core;
-  return 6 + 2 * core.n + core.d + static_cast<int>(system.control.tau.size()) + 2 * core.constraints.closure.rows +
-         system.extra_columns();
+  const Eigen::Index n = core.n, rows = core.constraints.closure.rows;
+  const std::pair<const char*, Eigen::Index> sizes[] = {
+      {"t", 1},
+      {"q_tree", n},
+      {"v_tree", n},
+      {"u", core.d},
+      {"tau", system.control.tau.size()},
+      {"phi", rows},
+      {"w", rows},
+      {"energy", 1},
+      {"dissipated", 1},
+      {"lyapunov", 1},
+      {"max_phi", 1},
+      {"max_phi_dot", 1},
+      {"extra", system.extra_columns()},
+  };
+  std::vector<RecordColumns> columns;
+  Eigen::Index begin = 0;
+  for (const auto& [name, size] : sizes) {
+    columns.push_back({name, begin, begin + size});
+    begin += size;
+  }
+  return columns;
 }
 
-Recorder::Recorder(const System& system) : width(row_width(system)) { momentum_.setZero(system.core.n); }
+Recorder::Recorder(const System& system) : columns(columns_of(system)), width(columns.back().end) {
+  momentum_.setZero(system.core.n);
+}
 
 void Recorder::start(Vector instants, double* rows, Eigen::Index max_rows) {
   instants_ = std::move(instants), rows_ = rows, max_rows_ = max_rows, next_ = filled = 0;

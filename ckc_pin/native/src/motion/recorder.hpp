@@ -1,17 +1,24 @@
 // Records the state at the output instants of a run, one row each.
 #pragma once
 
+#include <string>
+
 #include "motion/system.hpp"
 
 namespace ckc {
+
+// Where a quantity is in a row of the record: columns from begin to end.
+struct RecordColumns {
+  std::string name;
+  Eigen::Index begin, end;
+};
 
 class Recorder {
  public:
   explicit Recorder(const System& system);
 
-  // t, q', velocity, u, tau, phi, w, energy, energy dissipated by friction and impacts, Lyapunov function, largest
-  // |phi - w|, largest |phi_dot - w_dot|, extra columns of the system
-  const int width;
+  const std::vector<RecordColumns> columns;
+  const Eigen::Index width;  // numbers in a row
 
   void start(Vector instants, double* rows, Eigen::Index max_rows);  // (max_rows, width)
   bool is_due(double t) const { return next_ < instants_.size() && instants_(next_) <= t && filled < max_rows_; }
