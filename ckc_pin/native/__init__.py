@@ -4,7 +4,14 @@ import pinocchio as pin  # before _core: it loads the libraries that _core is li
 
 from ckc_pin.native import _core
 
-__all__ = ["_core"]
+EventQuantity = _core.EventQuantity
+Loop = _core.Loop
+NonDifferentiableReason = _core.NonDifferentiableReason
+RhsFailure = _core.RhsFailure
+Stop = _core.Stop
+StopReason = _core.StopReason
+
+__all__ = ["EventQuantity", "Loop", "NonDifferentiableReason", "RhsFailure", "Stop", "StopReason", "_core"]
 
 if _core.pinocchio_version != pin.__version__:
     raise ImportError(

@@ -16,7 +16,7 @@ from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.native._core import Loop, StopReason
+from ckc_pin.native import Loop, StopReason
 from ckc_pin.run.compiled_terms import COMPILE_AFTER_RHS, NEVER, compile_during_run
 from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.loop_terms import require_number

@@ -16,8 +16,7 @@ from ckc_pin.base.validation import is_number
 from ckc_pin.control.actuation import require_tau, require_u
 from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.errors import InputError
-from ckc_pin.native import _core
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason, _core
 from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import format_work

@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.native._core import Loop, RhsFailure, Stop, StopReason
+from ckc_pin.native import Loop, RhsFailure, Stop, StopReason
 from ckc_pin.run.events import EventFunction
 from ckc_pin.scene.spec import SolverSpec
 

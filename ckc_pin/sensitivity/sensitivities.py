@@ -20,7 +20,7 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
-from ckc_pin.native._core import EventQuantity, NonDifferentiableReason
+from ckc_pin.native import EventQuantity, NonDifferentiableReason
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.events import Event

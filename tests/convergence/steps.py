@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason
 from tests.analytic.five_bar import Array
 
 __all__ = ["steps_of"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q

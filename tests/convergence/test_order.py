@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.five_bar import FIVE_BAR, Array, Q

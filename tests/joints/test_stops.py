@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from scipy.special import ellipk
 
 from ckc_pin import InputError, Run, load, sensitivities, simulate
-from ckc_pin.native._core import RhsFailure, StopReason
+from ckc_pin.native import RhsFailure, StopReason
 from ckc_pin.run.stop_reasons import describe_stop
 from ckc_pin.scene.spec import SolverSpec
 from tests.analytic.five_bar import FIVE_BAR

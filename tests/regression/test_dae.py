@@ -13,7 +13,7 @@ from sksundae.ida import IDA
 
 from ckc_pin import Run, load, simulate
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason
 from ckc_pin.run.ivp import Dae, as_ivp
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.initial import Start

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Simulator, load_scene
-from ckc_pin.native._core import StopReason
+from ckc_pin.native import StopReason
 from ckc_pin.run.prepare import prepare
 
 RUNS: dict[str, tuple[str, dict[str, Any]]] = {
