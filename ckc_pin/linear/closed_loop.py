@@ -129,7 +129,7 @@ def _ideal_actuation(mechanism: Mechanism) -> dict[str, Any]:
     """Return the table of unlimited motors on the independent coordinates."""
     q, zeros = mechanism.partition.q, np.zeros(mechanism.d)
     turns = np.asfortranarray(np.eye(mechanism.n)[q])
-    return {"turns": turns, "direct": True, "limit": zeros + np.inf, "weights": zeros + 1.0, "preload": zeros}
+    return {"transmission": turns, "direct": True, "limit": zeros + np.inf, "weights": zeros + 1.0, "preload": zeros}
 
 
 @dataclass(frozen=True)

@@ -215,14 +215,14 @@ SWALLOWS = """
 import os, signal, sys, time
 import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
 
-def catalogue():
+def list_catalogue():
     try:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(60)
     {clause}
     time.sleep(60)
 
-ckc_pin.scene.scene.catalogue = catalogue
+ckc_pin.scene.scene.list_catalogue = list_catalogue
 ckc_pin.cli.main()
 """
 
@@ -239,12 +239,12 @@ IMPORTS = """
 import os, signal, sys, time
 import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
 
-def catalogue():
+def list_catalogue():
     import slow
     print("imported as a whole:", slow.done, flush=True)
     time.sleep(60)
 
-ckc_pin.scene.scene.catalogue = catalogue
+ckc_pin.scene.scene.list_catalogue = list_catalogue
 ckc_pin.cli.main()
 """
 SLOW = """

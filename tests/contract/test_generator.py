@@ -9,7 +9,7 @@ import pytest
 
 from ckc_pin import MechanismError, Run, check, load, load_scene, simulate
 from ckc_pin.mechanism.library import MAX_N, GeneratorSpec, generate
-from ckc_pin.mechanism.tree import MOST
+from ckc_pin.mechanism.tree import MAX_COORDINATES
 from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
 
@@ -89,12 +89,12 @@ def test_generated_mechanism_can_be_saved_and_loaded(tmp_path: Path) -> None:
 
 def test_too_large_tree_is_rejected(tmp_path: Path) -> None:
     """Pinocchio's workspace grows with the cube of the coordinates, so a small file could exhaust the memory."""
-    links = "".join(f'<link name="l{k}"/>' for k in range(MOST + 2))
+    links = "".join(f'<link name="l{k}"/>' for k in range(MAX_COORDINATES + 2))
     joints = "".join(
         f'<joint name="j{k}" type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'
-        for k in range(MOST + 1)
+        for k in range(MAX_COORDINATES + 1)
     )
     (tmp_path / "m.urdf").write_text(f'<robot name="chain">{links}{joints}</robot>')
     (tmp_path / "mechanism.toml").write_text('name = "chain"\nurdf = "m.urdf"\n')
-    with pytest.raises(MechanismError, match=f"{MOST + 1} coordinates.*at most {MOST}"):
+    with pytest.raises(MechanismError, match=f"{MAX_COORDINATES + 1} coordinates.*at most {MAX_COORDINATES}"):
         load(tmp_path)

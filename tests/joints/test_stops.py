@@ -233,7 +233,7 @@ def test_stop_reasons_at_contacts_name_joints_and_forces() -> None:
     assert "theta_1, theta_3 change between sticking, sliding and touching again and again at this instant" in chatter
     for text in (chatter, contact):
         assert "(forces on the joints at rest: theta_1 2.5 N m, -2 to 2 being possible); a scene with" in text
-    assert "theta_3 passed its stop within a step; a solver.max_step shorter than" in beyond
+    assert "theta_3 has passed its stop within a step; a solver.max_step shorter than" in beyond
 
 
 def test_joints_fixed_by_loops_have_no_events(tmp_path: Path) -> None:

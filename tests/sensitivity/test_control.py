@@ -117,7 +117,7 @@ def test_redundant_motors_that_cannot_give_u_stop_the_run(method: str, formulati
     overrides = {"t_end": 0.3, "solver.method": method, "formulation": formulation}
     result = sensitivities(with_three_motors(tmp_path / "x", "torque_limit = 1.0"), ["gravity.y"], overrides)
     assert result.run.status == "stopped"
-    assert "motors at their limits do not reach what is wanted of them together" in result.run.message
+    assert "motors at their torque limits cannot produce u together" in result.run.message
 
 
 def test_lengths_are_rejected_if_a_point_follows_a_path(tmp_path: Path) -> None:
