@@ -84,6 +84,13 @@ def right_handed(a: Array) -> tuple[Array, Array]:
     return e1 / np.linalg.norm(e1), np.cross(a, e1 / np.linalg.norm(e1))
 
 
+def rounding_of_log(loop: LoopSpec, A: Placement, B: Placement) -> float:
+    """Rounding error of the log of the relative rotation, where there is one: it grows towards half a turn."""
+    if loop.type not in ("weld", "prismatic"):
+        return 0.0
+    return 1e-14 / max(np.pi - Rotation.from_matrix(A[0].T @ B[0]).magnitude(), 1e-14)
+
+
 def half_turn_away(loop: LoopSpec, A: Placement, B: Placement) -> bool:
     """Whether the log of the relative rotation, where there is one, is far from its cut at half a turn."""
     return loop.type not in ("weld", "prismatic") or Rotation.from_matrix(A[0].T @ B[0]).magnitude() < 2.9
@@ -98,7 +105,7 @@ def test_phi_of_each_loop_type_matches_the_definition(kind: LoopType, seed: int,
     world, loop = random_world(seed), data.draw(loops(kind))
     q = world.configuration()
     A, B = placed(world, q, loop.frame_a), placed(world, q, loop.frame_b)
-    assert_close(Closed(world, loop).at(q).phi, table(loop, A, B), 1e-12)
+    assert_close(Closed(world, loop).at(q).phi, table(loop, A, B), 1e-12 + rounding_of_log(loop, A, B))
 
 
 @every_type
