@@ -120,10 +120,11 @@ def test_an_interrupted_run_of_a_worst_member_is_not_saved(tmp_path: Path, monke
 def test_a_cluster_that_is_interrupted_while_it_starts_leaves_nothing(
     temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    before = set(multiprocessing.active_children())  # joblib of other tests keeps its workers
     monkeypatch.setattr(cluster, "_start", interrupt_first(cluster._start))
     with pytest.raises(KeyboardInterrupt), cluster.connect(None, 1):
         pass
-    assert not multiprocessing.active_children()
+    assert set(multiprocessing.active_children()) <= before
     assert not list(temporary.iterdir())
 
 
