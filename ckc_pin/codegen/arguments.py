@@ -1,4 +1,4 @@
-"""The numbers of a mechanism that are arguments of its written-out code: what may vary without compiling anew."""
+"""Arguments of compiled terms: numbers of a mechanism that may change without compiling again."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import list_line_springs, list_loop_frames, list_spring_ends
 
 __all__ = ["Arguments", "argument_names", "constant", "near", "present", "values"]
 
-NEGLIGIBLE = 1e-14  # what is below is zero, and what is that near to one or minus one is that
+NEGLIGIBLE = 1e-14  # numbers closer than this to 0, 1 or -1 are replaced by it
 
 
 def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:
-    """Which numbers are arguments: what is zero is left out of the code, so that a planar mechanism's is planar."""
+    """Return which numbers are arguments. Zeros are not, so that the code of a planar mechanism is planar."""
     return {name: np.abs(x) > NEGLIGIBLE for name, x in given.items()}
 
 
@@ -34,9 +35,8 @@ def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list
     tree, spec = mechanism.tree, mechanism.spec
     joints, links = list(tree.model.names), mechanism.frames.bodies
     rows = [".".join(row) for row in mechanism.closure.names]
-    lines = [k for k, spring in enumerate(spec.spring) if spring.joint is None]
-    points = [f"loop.{loop.name}.{end}" for end in ("frame_a", "frame_b") for loop in spec.loop]
-    ends = [f"spring.{k}.{end}" for end in ("frame_a", "frame_b") for k in lines]
+    lines = list_line_springs(spec)
+    points, ends = ([name for name, _ in frames] for frames in (list_loop_frames(spec), list_spring_ends(spec)))
     entry = "xyz".__getitem__
     by_kind: dict[str, Callable[..., str]] = {
         "gravity": lambda k: f"gravity.{entry(k)}",

@@ -7,6 +7,7 @@ derivatives by the complex step, which are exact up to rounding.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -18,15 +19,31 @@ from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, Value, split_component, split_name, values_of
 from ckc_pin.mechanism.rows import Affine, Distance
-from ckc_pin.mechanism.spec import FrameSpec
+from ckc_pin.mechanism.spec import FrameSpec, MechanismSpec
 
-__all__ = ["ParameterMap", "model_numbers"]
+__all__ = ["ParameterMap", "list_line_springs", "list_loop_frames", "list_spring_ends", "model_numbers"]
 
 Numbers = NDArray[Any]  # real, or complex for a derivative
 
 COMPLEX_STEP = 1e-200
 REPRODUCTION_TOLERANCE = 1e-12  # of the largest number of a kind
 NON_NEGATIVE = ("stiffness", "damping", "rest_length", "friction", "armature", "restitution")
+
+
+def list_loop_frames(spec: MechanismSpec) -> list[tuple[str, str | FrameSpec]]:
+    """Return the frames of all loops with the beginnings of their parameters' names, in the order of the points."""
+    return [(f"loop.{x.name}.{end}", getattr(x, end)) for end in ("frame_a", "frame_b") for x in spec.loop]
+
+
+def list_line_springs(spec: MechanismSpec) -> list[int]:
+    """Return the indices of the springs between frames."""
+    return [k for k, spring in enumerate(spec.spring) if spring.joint is None]
+
+
+def list_spring_ends(spec: MechanismSpec) -> list[tuple[str, str | FrameSpec | None]]:
+    """Return the ends of all springs between frames with the beginnings of their parameters' names."""
+    lines = list_line_springs(spec)
+    return [(f"spring.{k}.{end}", getattr(spec.spring[k], end)) for end in ("frame_a", "frame_b") for k in lines]
 
 
 def model_numbers(mechanism: Mechanism) -> dict[str, Array]:
@@ -73,7 +90,7 @@ class ParameterMap:
     Beside those of `model_numbers`: by joint rotation (joints, 3, 3) of its placement, and of its body about the
     joint's origin moment = mass * centre (joints, 3) and origin_inertia (joints, 3, 3); by loop frame
     point_rotation (frames, 3, 3); reported (points, 3), the mechanism's named points; friction, restitution, lower,
-    upper (n); by motor torque_limit (m) and turns (m, n).
+    upper (n); by motor torque_limit (m) and transmission (m, n).
 
     Parameters
     ----------
@@ -164,8 +181,7 @@ def _more_numbers(mechanism: Mechanism, numbers: Mapping[str, Array]) -> dict[st
     model, joints, motors = mechanism.tree.model, mechanism.joints, mechanism.motors
     mass, centre = numbers["mass"], numbers["centre"]
     around = np.array([m * _point_inertia(c) for m, c in zip(mass, centre, strict=True)])
-    frames = [end for loop in ("frame_a", "frame_b") for end in (getattr(x, loop) for x in mechanism.spec.loop)]
-    placed = [mechanism.frames.find(frame, "parameters") for frame in frames]
+    placed = [mechanism.frames.find(frame, "parameters") for _, frame in list_loop_frames(mechanism.spec)]
     return {
         "rotation": np.array([placement.rotation for placement in model.jointPlacements]),
         "moment": mass[:, None] * centre,
@@ -177,7 +193,7 @@ def _more_numbers(mechanism: Mechanism, numbers: Mapping[str, Array]) -> dict[st
         "lower": joints.lower,
         "upper": joints.upper,
         "torque_limit": motors.torque_limit,
-        "turns": motors.transmission,
+        "transmission": motors.transmission,
     }
 
 
@@ -235,9 +251,8 @@ class _Members:
 
     def _add_spring(self, name: str, carrier: str, key: str, column: Numbers) -> None:
         spring = self.mechanism.spec.spring[int(carrier)]
-        lines = [k for k, x in enumerate(self.mechanism.spec.spring) if x.joint is None]
         if spring.joint is None:
-            self._set(key, lines.index(int(carrier)), column)
+            self._set(key, list_line_springs(self.mechanism.spec).index(int(carrier)), column)
         elif key == "damping":
             at = self.mechanism.tree.index[spring.joint]
             self._increase("joint_damping", at, column - spring.damping)
@@ -250,16 +265,16 @@ class _Members:
 
     def _add_motor(self, name: str, carrier: str, key: str, column: Numbers) -> None:
         number = self.mechanism.motors.names.index(carrier)
-        motor, turns = self.mechanism.spec.motor[number], self.mechanism.motors.transmission[number]
+        motor, gear = self.mechanism.spec.motor[number], self.mechanism.motors.transmission[number]
         ratio = self.varied.get(f"motor.{carrier}.ratio", motor.ratio)
         inertia = self.varied.get(f"motor.{carrier}.rotor_inertia", motor.rotor_inertia or 0.0)
         if key == "torque_limit":
             self._set("torque_limit", number, column)
         elif key == "ratio":
-            self._set("turns", number, turns * (column / motor.ratio)[:, None])
+            self._set("transmission", number, gear * (column / motor.ratio)[:, None])
         if key == "rotor_inertia" or (key == "ratio" and f"motor.{carrier}.rotor_inertia" not in self.varied):
-            for at in map(int, np.flatnonzero(turns)):
-                step = (turns[at] * ratio / motor.ratio) ** 2 * inertia - turns[at] ** 2 * (motor.rotor_inertia or 0.0)
+            for at in map(int, np.flatnonzero(gear)):
+                step = (gear[at] * ratio / motor.ratio) ** 2 * inertia - gear[at] ** 2 * (motor.rotor_inertia or 0.0)
                 self._increase("armature", at, step)
 
     def _set(self, key: str, at: Any, column: Numbers) -> None:
@@ -280,18 +295,15 @@ class _Members:
 
     def add_geometry(self) -> None:
         """Add placements of joints, bodies, loop frames, spring ends and points."""
-        if not any(split_name(name)[0] in ("link", "joint", "loop", "spring") for name in self.varied):
+        if not any(name.startswith("link.") or (x.ndim > 1 and name != "gravity") for name, x in self.varied.items()):
             return
-        mechanism, spec = self.mechanism, self.mechanism.spec
+        spec = self.mechanism.spec
         self.links: dict[str, tuple[int, Numbers, Numbers]] = {}  # body, rotation, translation in it
         self.joints: dict[str, tuple[int, Numbers, Numbers]] = {}
         with np.errstate(all="ignore"):  # members that are not physical
             self._place_links()
-            for body in range(1, mechanism.tree.model.njoints):
-                self._add_body(body)
-            loops = [(f"loop.{x.name}.{end}", getattr(x, end)) for end in ("frame_a", "frame_b") for x in spec.loop]
-            lines = [(k, x) for k, x in enumerate(spec.spring) if x.joint is None]
-            ends = [(f"spring.{k}.{end}", getattr(x, end)) for end in ("frame_a", "frame_b") for k, x in lines]
+            self._add_bodies()
+            loops, ends = list_loop_frames(spec), list_spring_ends(spec)
             points = [("", point.frame) for point in spec.point]
             for key, frames in (("point", loops), ("end", ends), ("reported", points)):
                 for k, (name, frame) in enumerate(frames):
@@ -329,17 +341,23 @@ class _Members:
                 rotation, translation = np.eye(3), np.zeros(3)
             self.joints[name] = self.links[_link(joint, "child")] = (body, rotation, translation)
 
-    def _add_body(self, body: int) -> None:
+    def _add_bodies(self) -> None:
         """Put together the links that fixed joints make one body."""
-        parts = []
+        parts: dict[int, list[tuple[Numbers, Numbers, Numbers, Numbers]]] = defaultdict(list)
         for link in self.mechanism.urdf.findall("link"):
             name, inertial = link.attrib["name"], link.find("inertial")
-            carrier, rotation, translation = self.links[name]
-            if carrier != body or inertial is None:
+            body, rotation, translation = self.links[name]
+            if body == 0 or inertial is None:
                 continue
             mass = self._value(f"link.{name}.mass")
             centre = translation + _turn(rotation, self._value(f"link.{name}.com"))
-            parts.append((mass, centre, rotation @ _inertial_rotation(inertial), self._link_inertia(name, mass)))
+            inertia = self._link_inertia(name, mass)
+            parts[body].append((mass, centre, rotation @ _inertial_rotation(inertial), inertia))
+        for body, links in parts.items():
+            self._add_body(body, links)
+
+    def _add_body(self, body: int, parts: Sequence[tuple[Numbers, Numbers, Numbers, Numbers]]) -> None:
+        """Add a body made of links: of each the mass, centre, rotation, and inertia about the centre."""
         if not any(x.ndim > ndim for part in parts for x, ndim in zip(part, (0, 1, 2, 2), strict=True)):
             return
         total = sum((mass for mass, *_ in parts), np.zeros(()))
@@ -404,7 +422,7 @@ def _rpy_matrix(rpy: Numbers) -> Numbers:
     rows = [[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
             [-sp, cp * sr, cp * cr]]  # fmt: skip
-    matrix: Numbers = np.moveaxis(np.array([[*row] for row in rows]), (0, 1), (-2, -1))
+    matrix: Numbers = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
     return matrix
 
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import list_loop_frames
 from ckc_pin.mechanism.parameters import split_name
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.native.sensitivity_tables import ParameterDerivative, PlacedKind, PlacementJoint
@@ -74,18 +76,16 @@ def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[P
         for k, slide in enumerate(slopes.get(key, ())):
             yield from _placement_joints(joints[k], place, k, np.zeros(3), slide)
     for k, slope in enumerate(slopes.get("point_rotation", ())):
-        loops = mechanism.spec.loop
-        end, loop = divmod(k, len(loops))
-        frame = mechanism.frames.find(loops[loop].frame_b if end else loops[loop].frame_a, "parameters")
+        end, loop = divmod(k, len(mechanism.spec.loop))
+        frame = mechanism.frames.find(list_loop_frames(mechanism.spec)[k][1], "parameters")
         turn = _angular(slope, frame.rotation)
-        for place, index in _directions(mechanism, loops[loop].name, end):
+        for place, index in _directions(mechanism, mechanism.spec.loop[loop].name, end):
             yield from _placement_joints(frame.joint, place, index, turn, np.zeros(3))
 
 
 def _angular(slope: Array, rotation: Array) -> Array:
     """Return the angular velocity of a rotation that changes with this slope, in the carrier's axes."""
-    spin = slope @ rotation.T
-    return np.array([spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]]) / 2
+    return np.asarray(pin.unSkew(slope @ rotation.T))
 
 
 def _placement_joints(
@@ -134,8 +134,8 @@ def _entries(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
 
 def _motors(mechanism: Mechanism, actuation: Actuation, slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """A gear acts where a motor's torque is what is given, a limit while it is reached."""
-    for number in {int(k) for k in np.argwhere(slopes.get("turns", np.zeros((0, 0))))[:, 0]}:
-        yield ParameterDerivative("gear", number, slopes["turns"][number])
+    for number in {int(k) for k in np.argwhere(slopes.get("transmission", np.zeros((0, 0))))[:, 0]}:
+        yield ParameterDerivative("gear", number, slopes["transmission"][number])
     for k in np.flatnonzero(slopes.get("torque_limit", ())):
         if mechanism.spec.motor[k].torque_limit == actuation.limit[k]:
             yield ParameterDerivative("torque_limit", int(k), mechanism.motors.transmission[k])
