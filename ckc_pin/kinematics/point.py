@@ -162,7 +162,7 @@ class Point(HasSummary):
         Raises
         ------
         InputError
-            `x` is not a position, or the point cannot reach it in this working mode. Working modes are told apart by
+            `x` is not a position, or the point cannot reach it in this working mode. Working modes differ in
             the sign of the determinant of Psi's Jacobian.
         """
         begin = self.kinematics((start or self.mechanism.assembled).q_tree)

@@ -200,7 +200,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     if there.rank > here.rank:
         warnings.append(
             f"the assembled configuration is singular: rank J is {here.rank} there and {there.rank} nearby; "
-            f"d = {tree.n - there.rank} is what the mechanism has nearby"
+            f"d = {tree.n - there.rank} is the number of freedoms nearby"
         )
     if not there.is_certain:
         warnings.append(

@@ -163,7 +163,7 @@ def lines() -> float:
     """Count the lines of the run loop's source in Python and C++."""
     files = [
         path
-        for folder in ("ckc_pin/simulation", "ckc_pin/native")
+        for folder in ("ckc_pin/run", "ckc_pin/native")
         for path in (ROOT / folder).rglob("*")
         if path.suffix in (".py", ".cpp", ".hpp")
     ]
@@ -194,7 +194,7 @@ def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
         "ms",
     )
     yield "ckc run five_bar/swing --json / import pinocchio", command, 1.8, ""
-    yield "lines of ckc_pin/simulation and native", lines, LINES, ""
+    yield "lines of ckc_pin/run and native", lines, LINES, ""
 
 
 def main(only: str = "") -> int:

@@ -14,18 +14,22 @@ import numpy as np
 from ckc_pin.view import style
 from ckc_pin.view.style import figure_style
 
-__all__ = ["count_imports", "draw_rooms", "main", "room_order"]
+__all__ = ["count_imports", "draw_rooms", "main", "room_layers", "room_order"]
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "ckc_pin"
 
 
-def room_order() -> list[str]:
-    """Return the rooms from top to bottom, as import-linter checks them."""
+def room_layers() -> list[list[str]]:
+    """Return the layers of rooms from top to bottom, as import-linter checks them."""
     layers = re.search(r"layers = \[(.*?)\]", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.DOTALL)
     assert layers is not None
-    names = [name for line in re.findall(r'"([^"]+)"', layers[1]) for name in line.split(" | ")]
-    return [name for name in names if name != "__main__"]
+    return [line.split(" | ") for line in re.findall(r'"([^"]+)"', layers[1]) if line != "__main__"]
+
+
+def room_order() -> list[str]:
+    """Return the rooms from top to bottom."""
+    return [room for layer in room_layers() for room in layer]
 
 
 def count_imports() -> Counter[tuple[str, str]]:

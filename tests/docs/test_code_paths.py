@@ -7,7 +7,7 @@ import re
 import pytest
 
 from scripts.site.gallery import ROOT
-from scripts.site.rooms import count_imports, room_order
+from scripts.site.rooms import count_imports, room_layers, room_order
 
 ROOM = re.compile(r"`((?:native/src|[a-z_]+)/[\w/]*(?:\.py|\.cpp|\.hpp)?)`")
 
@@ -51,10 +51,7 @@ def test_paths_of_the_core_exist(page: str) -> None:
 def test_contributing_lists_every_room_in_the_order_of_the_layers() -> None:
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("### Rooms")[2].partition("\n#")[0]
     listed = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in page.splitlines() if line.startswith("| `")]
-    layers = re.search(r"layers = \[(.*?)\]", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.DOTALL)
-    assert layers
-    rooms = [line.split(" | ") for line in re.findall(r'"([^"]+)"', layers[1]) if line != "__main__"]
-    assert listed == rooms
+    assert listed == room_layers()
 
 
 @pytest.mark.parametrize("folder", ["tests", "scripts"])

@@ -170,7 +170,7 @@ def _fixed_rows(extended: ExtendedClosure, domain: Domain, grid: Grid) -> tuple[
 def _search_aspect(
     system: LocusSystem, serial: bool, aspect: int, grids: Sequence[Grid], loci: list[_TracedLocus], is_border: bool
 ) -> None:
-    """Trace the curves that one aspect shows and that are not among the loci yet; append them."""
+    """Trace the curves in one aspect's grid that are not in `loci` yet, and append them to `loci`."""
     grid = grids[aspect]
     domain = grid.domain
     cells, places, spacing = _find_starts(system, grid, is_border)

@@ -1,4 +1,4 @@
-"""Parse and check the XML of a MuJoCo model before MuJoCo reads it, and remove what a mechanism does not have.
+"""Parse and check the XML of a MuJoCo model before MuJoCo reads it, and remove elements that mechanisms do not use.
 
 MuJoCo's compiler opens any file that a model names and allocates any size that a model asks for. A model from an
 untrusted source is therefore prepared here:
