@@ -10,7 +10,6 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import pivoted_columns
-from ckc_pin.control.allocation import allocate, minimum_norm_torques
 from ckc_pin.control.spec import AllocationSpec, Limit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -20,6 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 __all__ = ["Actuation", "Effort", "require_tau", "require_u"]
 
 NOT_REAL_KINDS = "cSUmMV"  # NumPy kinds that `astype(float)` converts silently or with a warning
+MIN_TRANSMISSION = 1e-9  # of the largest singular value: smaller ones of the transmission count as zero
 DRIVE_TOLERANCE = 1e-6  # relative singular value below which motors do not drive a motion
 
 
@@ -165,27 +165,9 @@ class Actuation:
             Minimum of the norm weighted by `weights`. If the motors cannot produce the force, the least-squares
             solution.
         """
-        return minimum_norm_torques((self.motors.transmission @ tangent).T, force, self.weights)
-
-    def apply_u(self, terms: Terms, u: Array) -> Effort:
-        """Return motor torques for u, within limits. `allocate` shares u among redundant motors.
-
-        Raises
-        ------
-        InputError
-            u has the wrong shape.
-        NumericalError
-            u is not finite.
-        """
-        u = require_u(u, self.mechanism)
-        if not np.isfinite(u).all():
-            raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
-        if self.is_direct:
-            tau = np.clip(u, -self.limit, self.limit)
-            return Effort(tau, self.motors.force(tau), tau)
-        transmission = (self.motors.transmission @ terms.rho).T  # u = transmission tau
-        tau = allocate(transmission, u, self.limit, self.weights, self.preload)
-        return Effort(tau, self.motors.force(tau), transmission @ tau)
+        scale = 1.0 / np.sqrt(self.weights)
+        transmission = (self.motors.transmission @ tangent).T
+        return np.asarray(scale * np.linalg.lstsq(transmission * scale, force, rcond=MIN_TRANSMISSION)[0], dtype=float)
 
     def apply_tau(self, terms: Terms, tau: Any) -> Effort:
         """Return the effort of motor torques, clipped at their limits.

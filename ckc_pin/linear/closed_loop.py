@@ -17,7 +17,7 @@ from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native import _core
-from ckc_pin.native.control import actuation_table, law_table
+from ckc_pin.native.control import actuation_table, apply_u, law_table
 from ckc_pin.native.plant import NONE, Plant
 from ckc_pin.native.tables import core_table
 
@@ -172,7 +172,7 @@ class LimitedClosedLoop:
         actuation = self.actuation
         if actuation is not None and np.isfinite(actuation.limit).any():
             u = self.law.u(t, state)
-            limited = actuation.apply_u(state, u)
+            limited = apply_u(actuation, state, u)
             if np.abs(limited.u - u).max() > U_TOLERANCE * np.abs(u).max():
                 tau = actuation.minimum_norm_torques(state.rho, u)
                 k = int(np.argmax(np.abs(tau) / actuation.limit))

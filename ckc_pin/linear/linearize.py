@@ -28,6 +28,7 @@ from ckc_pin.linear.linear_model import LinearModel, linear_model
 from ckc_pin.linear.statics import balance_at_rest
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation
+from ckc_pin.native.control import apply_u
 from ckc_pin.native.plant import NONE
 from ckc_pin.run.compiled_terms import select_library
 from ckc_pin.run.inverse import RecordedJoints
@@ -192,7 +193,7 @@ def _linearize_at_target(subject: _Subject) -> LinearModel:
         raise InputError(f'{mechanism.name}: at = "target": {violation}; give another controller.q_d')
     state, actuation = Terms(mechanism, solution.at, np.zeros(mechanism.n)), subject.actuation
     actuation.require_driven_freedoms(state.at)
-    tau = actuation.apply_u(state, law.u(0.0, state)).tau
+    tau = apply_u(actuation, state, law.u(0.0, state)).tau
     model = _linearize_at_rest(subject, state, tau, NONE, "at the target of its controller")
     return _add_closed_loop(subject, model, law, 0.0, state, 0.0)
 

@@ -10,13 +10,13 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.allocation import allocate
 from ckc_pin.dynamics.equilibrium import weight
 from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import STOP_TOLERANCE
+from ckc_pin.native.control import allocate
 from ckc_pin.native.plant import LOST_RANK
 
 __all__ = [

@@ -435,6 +435,17 @@ class NonDifferentiableEvent:
     @property
     def reason(self) -> NonDifferentiableReason: ...
 
+def allocate(
+    transmission: Annotated[NDArray[numpy.float64], dict(shape=(None, None), writable=False)],
+    u: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    limit: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    weights: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    preload: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]:
+    """
+    Return the motor torques with u = transmission tau that are nearest to a preload, within limits.
+    """
+
 class Loop:
     """The step loop of a mechanism with its controller, events and record."""
 
@@ -464,7 +475,7 @@ class Loop:
         self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, torques: bool
     ) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None] | None:
         """
-        Hold u, or motor torques, and advance. Return the stop and `state`; None if a number is not finite.
+        Hold u, or motor torques, and advance. Return the stop and `state`, None at a pause; None if a number is not finite.
         """
 
     def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None:

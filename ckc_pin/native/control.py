@@ -1,6 +1,7 @@
 """Tables that describe controllers and motors to the C++ core.
 
-Eqs. 14 and 16 and torques over time run in the core; any other controller is called from it.
+Eqs. 14 and 16 and torques over time run in the core; any other controller is called from it. The allocation of a force
+to the motors can also be computed alone.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.actuation import Actuation, Effort, require_u
 from ckc_pin.control.controllers import (
     Controller,
     RecordedTorques,
@@ -25,10 +26,13 @@ from ckc_pin.control.desired import Desired, Harmonics, Table
 from ckc_pin.control.point_path import Circle, Line, PointPath, PointTrajectory
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native import _core
 from ckc_pin.native.tables import closure_table, core_table, packed
 
-__all__ = ["actuation_table", "control_table", "law_table"]
+__all__ = ["actuation_table", "allocate", "apply_u", "control_table", "law_table"]
 
 QUARTER = math.pi / 2
 
@@ -90,6 +94,47 @@ def actuation_table(actuation: Actuation) -> dict[str, Any]:
         "weights": actuation.weights,
         "preload": actuation.preload,
     }
+
+
+def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array:
+    """Return the motor torques with u = transmission tau that are nearest to a preload, within limits.
+
+    If no torques within the limits give u, the deviation from u is penalized. Each row of u is measured by what one
+    unit of all motors contributes to it, so the torques stay almost continuous there.
+
+    Parameters
+    ----------
+    transmission : (d, m) array
+    u : (d,) array
+    limit, weights, preload : (m,) arrays
+        The torques minimize ``sum(weights * (tau - preload)**2)`` subject to |tau| <= limit, which may be infinite.
+
+    Returns
+    -------
+    (m,) array
+    """
+    return _core.allocate(np.asfortranarray(transmission, dtype=float), u, limit, weights, preload)
+
+
+def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
+    """Return motor torques for u, within limits. `allocate` shares u among redundant motors.
+
+    Raises
+    ------
+    InputError
+        u has the wrong shape.
+    NumericalError
+        u is not finite.
+    """
+    u = require_u(u, actuation.mechanism)
+    if not np.isfinite(u).all():
+        raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
+    if actuation.is_direct:
+        tau = np.clip(u, -actuation.limit, actuation.limit)
+        return Effort(tau, actuation.motors.force(tau), tau)
+    transmission = (actuation.motors.transmission @ terms.rho).T  # u = transmission tau
+    tau = allocate(transmission, u, actuation.limit, actuation.weights, actuation.preload)
+    return Effort(tau, actuation.motors.force(tau), transmission @ tau)
 
 
 def _clock(

@@ -42,6 +42,7 @@ from ckc_pin.kinematics.chart import Chart
 from ckc_pin.kinematics.sigma import follow_sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.native.control import apply_u
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, as_scene
@@ -135,8 +136,9 @@ def make_force(controller: Controller | TorqueController | None, actuation: Actu
         return lambda t, terms: actuation.zero.u_tree
     torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
-    act = actuation.apply_tau if torques else actuation.apply_u
-    return lambda t, terms: act(terms, law(t, terms)).u_tree
+    if torques:
+        return lambda t, terms: actuation.apply_tau(terms, law(t, terms)).u_tree
+    return lambda t, terms: apply_u(actuation, terms, law(t, terms)).u_tree
 
 
 def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, lsq_linear
 
-from ckc_pin.control.allocation import allocate
+from ckc_pin.native.control import allocate
 from tests.conftest import assert_close
 
 Array = np.ndarray

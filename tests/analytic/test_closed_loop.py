@@ -28,6 +28,7 @@ from ckc_pin.control.controllers import Controller
 from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import mechanism_file
+from ckc_pin.native.control import apply_u
 from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller
 from tests.analytic.five_bar import Array
 
@@ -94,7 +95,7 @@ def closed_by_differences(
     def acceleration(x: Array) -> Array:
         at = sigma(mechanism, x[:d], start).at
         state = Terms(mechanism, at, at.rho @ x[d:])
-        force = actuation.apply_u(state, controller.u(t, state)).u_tree
+        force = apply_u(actuation, state, controller.u(t, state)).u_tree
         return dae_acceleration(state, force + (0.0 if extra_force is None else extra_force(state.v_tree)))[q]
 
     def slope(k: int, h: float) -> Array:

@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from ckc_pin import Mechanism, Run, simulate
-from ckc_pin.control.allocation import allocate
 from ckc_pin.mechanism.library import library
+from ckc_pin.native.control import allocate
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
 

@@ -345,3 +345,15 @@ def test_overrides_beside_a_scene_are_rejected() -> None:
     assert Simulator(scene).step(None, 0.01).t == 0.01
     with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):
         Simulator(scene, {"formulation": "dae"})
+
+
+@pytest.mark.parametrize("formulation", ["dae", "reduced", "spf"])
+def test_pauses_of_the_native_loop_do_not_change_any_digit(formulation: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def positions(pause: float) -> list[bytes]:
+        monkeypatch.setattr("ckc_pin.run.simulator.PAUSE_S", pause)
+        simulator = Simulator("five_bar/swing", {"formulation": formulation})
+        states = [simulator.step(None, 0.05) for _ in range(12)]
+        states += [simulator.step(np.array([0.1, -0.2]), 0.05), *(simulator.step(None, dt) for dt in (0.5, 0.01, 0.3))]
+        return [state.q_tree.tobytes() for state in states]
+
+    assert positions(0.0) == positions(60.0)

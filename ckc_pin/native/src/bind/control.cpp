@@ -199,6 +199,19 @@ Actuation actuation_from_table(const nb::dict& table, const Core& core) {
           Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
 }
 
+// `transmission` (d, motors): u = transmission tau.
+Vector allocate(Table transmission, Given u, Given limit, Given weights, Given preload) {
+  const Eigen::Index d = transmission.rows(), m = transmission.cols();
+  require(transmission.allFinite(), "transmission: finite numbers are needed");
+  require(u, d, "u"), require(weights, m, "weights"), require(preload, m, "preload");
+  require(limit.size() == m && (limit.array() >= 0).all(), "limit: a positive number for each motor is needed");
+  require((weights.array() > 0).all(), "weights: positive numbers are needed");
+  Vector tau(m);
+  Allocation(static_cast<int>(m), static_cast<int>(d), limit, weights, preload)
+      .allocate(transmission.transpose(), u, tau);
+  return tau;
+}
+
 Sensor sensor_from_table(const nb::dict& table, const Core& core) {
   Sensor sensor;
   sensor.resolution = get<Vector>(table, "resolution");
@@ -233,6 +246,12 @@ std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& c
   }
   require(control->sampling || !(control->sensor || control->drive), "sensor and drive: a clock is needed");
   return control;
+}
+
+void bind_allocation(nb::module_& m) {
+  using namespace nb::literals;
+  m.def("allocate", &allocate, "transmission"_a, "u"_a, "limit"_a, "weights"_a, "preload"_a,
+        "Return the motor torques with u = transmission tau that are nearest to a preload, within limits.");
 }
 
 }  // namespace ckc

@@ -19,19 +19,7 @@ using RecordArray = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::c
 
 constexpr const char* method_names[] = {"DOP853", "RK45", "Radau"};
 
-// Build the formulation, extended by sensitivities if its table has them; `sensitivities` then receives their results.
-template <class Formulation, class... Arguments>
-std::unique_ptr<System> with_sensitivities(const nb::dict& table, SensitivityResults*& sensitivities,
-                                           Arguments&&... arguments) {
-  if (!table.contains("sensitivities")) return std::make_unique<Formulation>(std::forward<Arguments>(arguments)...);
-  auto system = std::make_unique<SensitivitySystem<Formulation>>(
-      sensitivity_table(nb::cast<nb::dict>(table["sensitivities"])), std::forward<Arguments>(arguments)...);
-  sensitivities = system.get();
-  return system;
-}
-
-std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb::dict& table,
-                                          SensitivityResults*& sensitivities) {
+std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb::dict& table) {
   const auto kind = get<std::string>(table, "kind");
   const double tolerance = get<double>(table, "tolerance");
   require(tolerance > 0, "tolerance: a positive number is needed");
@@ -41,14 +29,13 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
     const bool projects = get<bool>(table, "projects");
     require(!table.contains("sensitivities") || (projects && alpha == 0 && beta == 0),
             "sensitivities: the DAE must be projected onto the constraint manifold");
-    return with_sensitivities<Dae>(table, sensitivities, core, control, tolerance, projects, alpha, beta);
+    return std::make_unique<Dae>(core, control, tolerance, projects, alpha, beta);
   }
   const double epsilon = get<double>(table, "epsilon");
   const bool actual = get<bool>(table, "actual");
   require(epsilon > 0, "epsilon: a positive number is needed");
   if (kind == "level_set")
-    return with_sensitivities<LevelSet>(table, sensitivities, core, control, epsilon, actual, tolerance,
-                                        get<double>(table, "rhs_slack"));
+    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "rhs_slack"));
   require(kind == "printed", "formulation: dae, level_set or printed");
   require(core.tree.roots.empty(), "eq. 8 as printed: trees with free roots are not supported");
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
@@ -80,7 +67,12 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
              const nb::dict& solver, const nb::list& events) {
   loop.core = core_from_table(core);
   auto acting = control_from_table(control, *loop.core, loop.view);
-  auto system = system_from_table(*loop.core, *acting, formulation, loop.sensitivities);
+  auto system = system_from_table(*loop.core, *acting, formulation);
+  std::unique_ptr<SensitivityIntegrand> sensitivities;
+  if (formulation.contains("sensitivities"))
+    sensitivities = std::make_unique<SensitivityIntegrand>(
+        *system, sensitivity_table(nb::cast<nb::dict>(formulation["sensitivities"])));
+  loop.sensitivities = sensitivities.get();
   const Options options{
       get<std::string>(solver, "method"),       get<double>(solver, "rtol"),     get<double>(solver, "atol"),
       get<double>(solver, "max_step"),          get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
@@ -91,7 +83,8 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   for (nb::handle event : events)
     functions.push_back(event_from_table(nb::cast<const EventTable&>(event), *loop.core, loop.view));
   loop.core->profile.on = get<bool>(solver, "profile");
-  loop.step_loop = std::make_unique<StepLoop>(std::move(acting), std::move(system), options, std::move(functions));
+  loop.step_loop = std::make_unique<StepLoop>(std::move(acting), std::move(system), std::move(sensitivities), options,
+                                              std::move(functions));
 }
 
 namespace {
@@ -162,11 +155,13 @@ nb::object state(Loop& loop) {
   return nb::make_tuple(step_loop.t(), numbers, loop.partition_lists.q, loop.partition_lists.z);
 }
 
-// Hold u or torques and advance. Return the stop and the state; None if a number is not finite.
+// Hold u or torques and advance. Return the stop and the state, which is None at a pause; None if a number is not
+// finite.
 nb::object step(Loop& loop, nb::handle u, double until, double pause, bool torques) {
   if (!set_control(loop, u, torques)) return nb::none();
   const Stop stop = advance(loop, until, false, pause, std::numeric_limits<double>::infinity());
-  return nb::make_tuple(stop, state(loop));
+  // Projecting the state would move the initial guesses of the steps that follow.
+  return nb::make_tuple(stop, stop.reason == Stop::pause ? nb::none() : state(loop));
 }
 
 // Explain why no step could be made.
@@ -276,7 +271,7 @@ double seconds(Loop& loop, Table states, int rounds, bool of_jacobian) {
 void bind_loop(nb::module_& m) {
   nb::class_<View>(m, "View", "The state of the loop during a callback.")
       .def("term", &View::term, "stamp"_a, "name"_a, nb::sig("def term(self, stamp: int, name: str) -> typing.Any"));
-  bind_types(m);
+  bind_types(m), bind_allocation(m);
   nb::class_<Loop> binding(m, "Loop", "The step loop of a mechanism with its controller, events and record.");
   binding
       .def("__init__", &construct, "core"_a, "formulation"_a, "control"_a, "solver"_a, "events"_a,
@@ -289,7 +284,8 @@ void bind_loop(nb::module_& m) {
            nb::sig("def step(self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, "
                    "torques: bool) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], "
                    "list[int]] | None] | None"),
-           "Hold u, or motor torques, and advance. Return the stop and `state`; None if a number is not finite.")
+           "Hold u, or motor torques, and advance. Return the stop and `state`, None at a pause; None if a number is not "
+           "finite.")
       .def("state", &state,
            nb::sig("def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None"),
            "Return t, the numbers (q', velocity, v' of the terms, w), q and z of the present state; None if it cannot "

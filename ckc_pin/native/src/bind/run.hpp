@@ -2,9 +2,10 @@
 #pragma once
 
 #include "bind/control.hpp"
+#include "motion/dae.hpp"
 #include "motion/level_set.hpp"
 #include "motion/loop.hpp"
-#include "sensitivity/sensitivity_system.hpp"
+#include "sensitivity/sensitivity_integrand.hpp"
 
 namespace ckc {
 
@@ -12,7 +13,7 @@ struct Loop {
   std::shared_ptr<View> view = std::make_shared<View>();
   std::unique_ptr<Core> core;
   std::unique_ptr<StepLoop> step_loop;
-  SensitivityResults* sensitivities = nullptr;  // of the step loop's system; null without sensitivities
+  SensitivityIntegrand* sensitivities = nullptr;  // the step loop's integrand; null without sensitivities
   nb::object rows;
   PartitionLists partition_lists;
   long rhs_before_compiled = 0;  // right-hand sides before compiled terms were used

@@ -23,7 +23,7 @@ SensitivityParameter parameter_from_row(const nb::tuple& row) {
   return result;
 }
 
-SensitivityResults& sensitivities_of(Loop& loop) {
+SensitivityIntegrand& sensitivities_of(Loop& loop) {
   require(loop.sensitivities, "loop: it was built without sensitivities");
   return *loop.sensitivities;
 }
@@ -36,13 +36,12 @@ Matrix state_sensitivities(Loop& loop) { return sensitivities_of(loop).state_sen
 // the impact.
 std::optional<Vector> time_shifts(Loop& loop, int coordinate, bool of_rate) {
   StepLoop& step_loop = *loop.step_loop;
-  SensitivityResults& system = sensitivities_of(loop);
+  const SensitivityIntegrand& integrand = sensitivities_of(loop);
   require_indices({coordinate}, loop.core->n, "coordinate");
-  if (of_rate && system.impact_at == step_loop.t()) return system.sensitivities().time_shift(coordinate);
+  if (of_rate && integrand.impact_at == step_loop.t()) return integrand.sensitivities.time_shift(coordinate);
   Vector a(loop.core->n);
   if (!step_loop.sync_core() || !step_loop.system->acceleration(step_loop.t(), a)) return {};
-  const Vector result = system.sensitivities().time_shift({coordinate, of_rate}, step_loop.system->velocity, a,
-                                                          system.state_sensitivities(step_loop.y()));
+  const Vector result = integrand.time_shift({coordinate, of_rate}, step_loop.y(), a);
   return result.allFinite() ? std::optional(result) : std::nullopt;
 }
 
@@ -87,7 +86,7 @@ void bind_sensitivities(nb::class_<Loop>& binding) {
       .def(
           "rate_evaluations",
           [](Loop& loop) {
-            const Sensitivities& sensitivities = sensitivities_of(loop).sensitivities();
+            const Sensitivities& sensitivities = sensitivities_of(loop).sensitivities;
             return std::pair(sensitivities.compiled_evaluations, sensitivities.general_evaluations);
           },
           "Return how often the rates of sensitivities were computed: by compiled terms, by Pinocchio's.")

@@ -43,7 +43,7 @@ double Crossing::time_to_crossing(const Rank& end, double step_size, double t_bo
   const auto extrapolate = [&](double at) {  // with constant acceleration
     const double h = at - t;
     y_ = step_.y + h * step_.f;
-    if (nq == core.n) y_.head(nq) += (0.5 * h * h) * step_.f.tail(core.n);
+    if (nq == core.n) y_.head(nq) += (0.5 * h * h) * step_.f.segment(nq, core.n);
   };
   const auto set_extrapolated = [&](double at) { return extrapolate(at), system_.set_core_configuration(y_); };
   const double linear_time = end.value / -end.rate, from = t + 0.3 * linear_time, to = t + 1.3 * linear_time;

@@ -26,7 +26,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
 
 void Dae::start(double, In q_tree, In v, In, Out y) {
   elimination.reset(core);
-  y << q_tree, v;
+  y.head(core.tree.nq) = q_tree, y.segment(core.tree.nq, core.n) = v;
 }
 
 void Dae::set_core(In q_tree, bool with_inertia) {
@@ -46,9 +46,10 @@ bool Dae::set_core_configuration(In y) {
   return true;
 }
 
-bool Dae::rhs(double t, In y, Out y_dot) {
+bool Dae::motion_rhs(double t, In y, Out y_dot) {
   if (!finite(y)) return fail(RhsFailure::not_finite);
   const auto v = y.tail(core.n);
+  v_tree = v;
   // only the acceleration is needed
   if (core.compiled && core.joints.locked.empty() && !control.needs_terms() && !is_stabilized()) {
     q_tree_ = y.head(core.tree.nq);
@@ -95,7 +96,7 @@ bool Dae::evaluate_rate(double t, In v, Out y_dot) {
 }
 
 // Derivatives with respect to the numbers of q'; a quaternion stands for the rotation of its normalized value.
-bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const int n = core.n, nq = core.tree.nq;
   if (!finite(y)) return false;
   q_tree_ = y.head(nq);
@@ -109,7 +110,7 @@ bool Dae::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
     residual_.noalias() = core.constraints.J * v;
     residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.constraints.phi;
   }
-  if (!acceleration_derivatives(q_tree_, v, residual_)) return System::jacobian(t, y, jacobian, evaluations);
+  if (!acceleration_derivatives(q_tree_, v, residual_)) return System::motion_jacobian(t, y, jacobian, evaluations);
   if (is_stabilized() && core.constraints.closure.rows) {
     DynamicsDerivatives& by = core.derivatives;
     by.compute(q_tree_, v, eq_1_.a, zero_correction_);  // for the constraint rows; compiled terms do not compute these
@@ -150,7 +151,6 @@ bool Dae::closure_step(In residual) {
 }
 
 bool Dae::project_onto_manifold(In y) {
-  const int n = core.n;
   set_core_configuration(y);
   const double tolerance = tolerance_ * core.tolerance_scale();
   for (int k = 0; largest_entry(core.constraints.phi) > tolerance; ++k) {
@@ -161,7 +161,7 @@ bool Dae::project_onto_manifold(In y) {
     set_core(q_tree_);
     if (largest_entry(residual_) <= tolerance) break;  // the remaining residual is a contradiction of redundant rows
   }
-  velocity = y.tail(n);
+  velocity = velocity_in(y);
   residual_.noalias() = core.constraints.J * velocity;
   if (largest_entry(residual_) <= rounding * core.constraints.J.norm() * velocity.norm()) return true;
   if (!closure_step(residual_)) return false;
@@ -170,8 +170,7 @@ bool Dae::project_onto_manifold(In y) {
 }
 
 bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
-  const int n = core.n;
-  if (!finite(y)) return false;
+  if (!finite(y.head(motion_size))) return false;
   q_tree_ = y.head(core.tree.nq);
   core.tree.normalize(q_tree_);
   set_core(q_tree_, false);
@@ -183,10 +182,10 @@ bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
     // the remaining error is the square of this step
     if (largest_entry(step_.cwiseQuotient(core.scales.columns)) <= newton_tolerance) break;
   }
-  residual_.noalias() = core.constraints.J * y.tail(n);
+  residual_.noalias() = core.constraints.J * velocity_in(y);
   if (!core.cheapest_closure_step(residual_, step_)) return false;
   ++counts.factorizations;
-  velocity = y.tail(n) + step_;
+  velocity = velocity_in(y) + step_;
   return evaluate_rate(t, velocity, y_dot);
 }
 
@@ -213,12 +212,11 @@ bool Dae::reduce_to_freedoms(In y, Matrix& jacobian) {
 }
 
 bool Dae::sync_core(double, In y) {
-  const int n = core.n;
   if (projects_) {
     if (!project_onto_manifold(y)) return false;
   } else {
     set_core_configuration(y);
-    velocity = y.tail(n);
+    velocity = velocity_in(y);
   }
   v_tree = velocity;
   set_q_and_q_dot(core.q_tree, velocity);
@@ -231,16 +229,21 @@ bool Dae::sync_core_at_start(double t, In y) {
   return true;
 }
 
+void Dae::move_core_to_last_rhs(In y) {
+  set_core_configuration(y);
+  v_tree = velocity_in(y);
+}
+
 bool Dae::sync_core_at_last_rhs(double, In y) {
   set_core_configuration(y);
-  velocity = v_tree = y.tail(core.n);
+  velocity = v_tree = velocity_in(y);
   if (elimination.is_due()) elimination.remember_state(core.q_tree, v_tree, applied_force(v_tree));
   return true;
 }
 
 bool Dae::sync_core_unprojected(double, In y) {
   if (!set_core_configuration(y)) return false;
-  velocity = v_tree = y.segment(core.tree.nq, core.n);
+  velocity = v_tree = velocity_in(y);
   set_q_and_q_dot(core.q_tree, velocity);
   return true;
 }
@@ -258,12 +261,11 @@ void Dae::write_projected_state(Out y) const {
 }
 
 Accepted Dae::accept_step(double, Out y, double) {
-  const int n = core.n;
   elimination.accept_step(core);
   if (!projects_) return Accepted::unchanged;
   set_core_configuration(y);
-  residual_.noalias() = core.constraints.J * y.tail(n);
-  const double drift_rate = largest_entry(residual_) / (1.0 + largest_entry(y.tail(n)));
+  residual_.noalias() = core.constraints.J * velocity_in(y);
+  const double drift_rate = largest_entry(residual_) / (1.0 + largest_entry(velocity_in(y)));
   if (std::max(largest_entry(core.constraints.phi), drift_rate) <= tolerance_ * core.tolerance_scale())
     return Accepted::unchanged;
   if (!project_onto_manifold(y)) return Accepted::rejected;

@@ -12,7 +12,6 @@ class Dae : public System {
   Dae(Core& core, Control& control, double tolerance, bool projects, double alpha, double beta);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool rhs(double t, In y, Out y_dot) override;
   bool sync_core(double t, In y) override;
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
@@ -23,17 +22,18 @@ class Dae : public System {
   Accepted accept_step(double t, Out y, double margin) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
   bool conserves_energy() const override { return projects_; }
-  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   bool reduce_to_freedoms(In y, Matrix& jacobian) override;
-  bool tree_acceleration(In f, Out a) const override { return a = f.tail(core.n), true; }
-  void add_velocity(Out y, In v) const override { y.tail(core.n) += v; }
+  const Vector& configuration_at_last_rhs() const override { return q_tree_; }
+  void move_core_to_last_rhs(In y) override;
+  bool tree_acceleration(In f, Out a) const override { return a = velocity_in(f), true; }
+  void add_velocity(Out y, In v) const override { y.segment(core.tree.nq, core.n) += v; }
   void add_displacement(Out y, In step) const override { core.tree.integrate(y.head(core.tree.nq), step); }
   bool rate_on_manifold(double t, In y, Out y_dot) override;
 
- protected:
-  Vector q_tree_;  // configuration of the last right-hand side
-
  private:
+  bool motion_rhs(double t, In y, Out y_dot) override;
+  bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
+  Eigen::Ref<const Vector> velocity_in(In y) const { return y.segment(core.tree.nq, core.n); }
   void set_core(In q_tree, bool with_inertia = true);  // and compute J
   void set_q_and_q_dot(In q_tree, In v);
   bool compute_forces(double t, In q_tree, In v);  // applied forces at this state
@@ -47,6 +47,7 @@ class Dae : public System {
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long core_configuration_ = -1;  // core.configuration_count after this object has set the core
+  Vector q_tree_;  // configuration of the last right-hand side
   Vector step_, z_step_, residual_, no_force_;
   Matrix stabilization_;
 };

@@ -91,11 +91,11 @@ bool Explicit::stages(double h) {
   return true;
 }
 
-// Error of the full motion, which does not depend on the coordinates in y, and of the auxiliary part of y.
+// Error of the full motion, which does not depend on the coordinates in y, and of the integrand.
 double Explicit::error(double h) {
   const bool full_motion = this->checks_full_motion(h);
   const Eigen::Index motion_size = full_motion ? step_.x.size() : 0,
-                     remaining_size = full_motion ? system_.auxiliary_size() : step_.y.size();
+                     remaining_size = full_motion ? system_.size - system_.motion_size : step_.y.size();
   double square[2] = {0.0, 0.0};
   const auto add_weighted_error = [&](const Matrix& rates, const Vector& from, const Vector& to, Eigen::Index last) {
     scale_ = tolerance_.scale(from, to);

@@ -72,7 +72,8 @@ bool JointModeTransitions::update(double t, Out y, const std::vector<Event>& tri
   if (!was_decided_)
     for (int k = 0; k < core_.n; ++k)
       if (joints_.has_friction_at(k) && !is_at_rest(k)) joints_.sliding_direction[k] = v_(k) > 0.0 ? 1 : -1;
-  if (!system_.before_transition(t, y, find_arrivals(triggered))) return false;
+  Integrand* const integrand = system_.integrand;
+  if (integrand && !integrand->before_transition(t, y, find_arrivals(triggered))) return false;
   joints_.sliding_direction = previous_direction;
   joints_.rate_rounding = rate_rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
   std::optional<double> energy;
@@ -80,13 +81,13 @@ bool JointModeTransitions::update(double t, Out y, const std::vector<Event>& tri
   // The loss of the rounds, and of rates up to rounding that are set to zero afterwards.
   if (energy) joints_.impact_loss += *energy - core_.energy(v_, step_).kinetic;
   was_decided_ = true;
-  return system_.after_transition(t, y, arrivals_, tolerance_.rtol, tolerance_.atol);
+  return !integrand || integrand->after_transition(t, y, arrivals_, tolerance_.rtol, tolerance_.atol);
 }
 
 // An exceeded holding force changes no velocity, so it has no arrival of its own. If a joint rests at its stop
 // without being held there, its arrival is that it comes to rest.
-std::vector<System::JointArrival> JointModeTransitions::find_arrivals(const std::vector<Event>& triggered) const {
-  std::vector<System::JointArrival> arrivals;
+std::vector<JointArrival> JointModeTransitions::find_arrivals(const std::vector<Event>& triggered) const {
+  std::vector<JointArrival> arrivals;
   for (int k = 0; k < core_.n; ++k)
     if (approaches_stop(k)) arrivals.push_back({k, false, nearby_stop_[k]});
   for (const Event& event : triggered) {
@@ -180,7 +181,8 @@ bool JointModeTransitions::resolve_impacts(double t, Out y, std::optional<double
       was_hit[i] |= impulses(i) > 0.0;
     }
     step += step_;
-    return system_.at_impact(step_, struck_joints, responses_(Eigen::all, stops), x, restitution);
+    return !system_.integrand ||
+           system_.integrand->at_impact(step_, struck_joints, responses_(Eigen::all, stops), x, restitution);
   };
   Vector gap_rates;
   if (!resolve_impact(problem, apply, gap_rates)) return false;

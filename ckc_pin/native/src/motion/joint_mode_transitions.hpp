@@ -24,7 +24,7 @@ class JointModeTransitions {
  private:
   bool sync_state(double t, Out y);  // and write the projected state to y
   // Joints that come to rest or reach a stop at this instant.
-  std::vector<System::JointArrival> find_arrivals(const std::vector<Event>& triggered) const;
+  std::vector<JointArrival> find_arrivals(const std::vector<Event>& triggered) const;
   // `energy`: kinetic energy before an impact, J; none without an impact
   bool resolve_impacts(double t, Out y, std::optional<double>& energy);
   bool resolve_holding(double t, Out y, const Indices& previously_locked);
@@ -47,7 +47,7 @@ class JointModeTransitions {
   bool was_decided_ = false;  // since the start
   Vector v_, a_, held_acceleration_, rest_speed_, step_;
   Indices nearby_stop_;                         // (n): side of the stop that a joint is at, as `stop_side`
-  std::vector<System::JointArrival> arrivals_;  // joints that have arrived in their new mode at this instant
+  std::vector<JointArrival> arrivals_;  // joints that have arrived in their new mode at this instant
   bool holding_was_exceeded_ = false;           // one of the events was an exceeded holding force
   Matrix responses_, A_;
   Vector b_, low_, high_, scale_, x_, rounding_;

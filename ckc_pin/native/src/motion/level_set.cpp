@@ -74,7 +74,7 @@ bool LevelSet::project_state(double t, In y, double tolerance) {
   else
     for (int k = 0; k < d; ++k) q(k) = core.q_tree(core.tree.q_index[core.q[k]]);
   core.compute_rho();
-  q_dot = y.tail(d);
+  q_dot = y.segment(d, d);
   core.multiply_rho(q_dot, v_tree);
   velocity = v_tree;
   if (!on_manifold_) {
@@ -114,7 +114,7 @@ bool LevelSet::project_from_predicted(double tolerance) {
   return closed;
 }
 
-bool LevelSet::rhs(double t, In y, Out y_dot) {
+bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!finite(y)) return fail(RhsFailure::not_finite);
   if (!project_state(t, y, disagreements_ || project_to_rounding_ ? tolerance_ : std::max(tolerance_, rhs_slack_)))
@@ -145,10 +145,10 @@ bool LevelSet::rhs(double t, In y, Out y_dot) {
   return finite(y_dot) || fail(RhsFailure::not_finite);
 }
 
-bool LevelSet::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+bool LevelSet::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
   project_to_rounding_ = true;  // the slack of the right-hand side is much larger than a difference step
-  const bool exists = System::jacobian(t, y, jacobian, evaluations);
+  const bool exists = System::motion_jacobian(t, y, jacobian, evaluations);
   project_to_rounding_ = false;
   return exists;
 }
@@ -195,7 +195,7 @@ void LevelSet::rate_pairs(std::vector<std::pair<int, int>>& of) const {
 
 bool LevelSet::tree_acceleration(In f, Out a) const {
   if (!on_manifold_) return false;
-  const auto q_ddot = f.tail(core.d);
+  const auto q_ddot = f.segment(core.d, core.d);
   if (!has_tree_acceleration_) return core.tree_acceleration(q_ddot, a), true;
   a = a_tree_;  // implicit methods ask for another q_ddot than that of f
   for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
@@ -241,7 +241,7 @@ void LevelSet::full_motion(In f, Out x, Out x_dot) const {
     tree_acceleration(f, x_dot.tail(core.n));
   } else {
     x << core.q_tree, q_dot;
-    x_dot.tail(core.d) = f.tail(core.d);
+    x_dot.tail(core.d) = f.segment(core.d, core.d);
   }
 }
 

@@ -14,7 +14,6 @@ class LevelSet : public System {
   LevelSet(Core& core, Control& control, double epsilon, bool actual, double tolerance, double rhs_slack);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool rhs(double t, In y, Out y_dot) override;
   bool sync_core(double t, In y) override { return project_state(t, y, tolerance_); }
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
@@ -22,7 +21,6 @@ class LevelSet : public System {
   double coordinate_margin() override { return phi_z_margin(); }
   Accepted accept_step(double t, Out y, double margin) override;
   bool restore_partition(double t, Out y, bool& changed) override;
-  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
   double w_decay_rate() const override { return -1.0 / epsilon_; }
   double boundary_layer_time() const override { return on_manifold_ ? System::boundary_layer_time() : epsilon_; }
@@ -39,6 +37,8 @@ class LevelSet : public System {
   void add_rounding(In x, Out scale) const override;
 
  private:
+  bool motion_rhs(double t, In y, Out y_dot) override;
+  bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   void update_w(double t);
   void predict_from_accepted();
   void reset_coordinates(In q_tree);  // chart, predictor and margins for the core's partition

@@ -22,10 +22,17 @@ static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
   return system.crosses_singularities ? std::make_unique<Collocation>(system, work) : nullptr;
 }
 
-StepLoop::StepLoop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_, Options options,
-                   std::vector<Event> list)
+// The system with the integrand appended to it, as the members built after it need it.
+static std::unique_ptr<System> with_integrand(std::unique_ptr<System> system, Integrand* integrand) {
+  if (integrand) system->append(*integrand);
+  return system;
+}
+
+StepLoop::StepLoop(std::unique_ptr<Control> control_, std::unique_ptr<System> system_,
+                   std::unique_ptr<Integrand> integrand_, Options options, std::vector<Event> list)
     : control(std::move(control_)),
-      system(std::move(system_)),
+      system(with_integrand(std::move(system_), integrand_.get())),
+      integrand(std::move(integrand_)),
       recorder(*system),
       events(*system, now, std::move(list)),
       options_(std::move(options)),
@@ -47,20 +54,26 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   control->failure = {};
   control->start();
   reset_joints();
-  system->start(t, q_tree, v_tree, w, now.y);
-  now.t = now.t_old = t, now.y_old = now.y, now.h = 0.0;
+  start_state();
+  now.t_old = now.t, now.y_old = now.y, now.h = 0.0;
   steps = {}, crossings.clear(), accepted_steps_ = 0, next_stiffness_check_ = 0, last_step_size_ = 0.0, pace_rhs_ = 0,
   pace_time_ = t;
   method_ = nullptr, radau_.reset(), segment_end_ = t;
   state_is_accepted_ = rate_is_known_ = cannot_repeat_ = false;
-  waiting_step_.reset(), advances_unchanged_ = 0;
+  waiting_step_.reset(), advances_unchanged_ = 0, is_paused_ = false;
   crossing_.reset();
   events.reset();
 }
 
+void StepLoop::start_state() {
+  system->start(start_.t, start_.q_tree, start_.v_tree, start_.w, now.y);
+  if (integrand) integrand->start(start_.q_tree, start_.v_tree, now.y);
+  now.t = start_.t;
+}
+
 void StepLoop::state_changed() {
   return_to_present();
-  advances_unchanged_ = 0;
+  advances_unchanged_ = 0, is_paused_ = false;
   rate_is_known_ = false, cannot_repeat_ = true;
   joint_modes_known_ = !system->core.joints.has_events();
   if (method_) method_->reset_history();
@@ -74,8 +87,9 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
   const auto started = Clock::now();
   const auto elapsed = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
   system->may_change_partition = !control->needs_fixed_partition();
+  const bool continues = std::exchange(is_paused_, false) && until == target_;
   const double from = t();
-  target_ = until, ++advances_unchanged_;
+  if (!continues) target_ = until, ++advances_unchanged_;
   if (waiting_step_) {
     if (until < now.t_new) return report_present(until);
     const CompletedStep step = *waiting_step_;
@@ -89,8 +103,11 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
     if (changed) state_is_accepted_ = false, state_changed();
   }
   may_step_beyond_ = !final && !control->law && events.is_empty();
-  // as far as nothing has changed recently
-  double ahead = may_step_beyond_ ? static_cast<double>(advances_unchanged_ - 1) * (until - from) : 0.0;
+  // as far as nothing has changed recently; `advances_unchanged_` is zero if the partition has just been restored
+  if (!continues)
+    reach_beyond_ = may_step_beyond_ && advances_unchanged_ > 0
+                        ? static_cast<double>(advances_unchanged_ - 1) * (until - from)
+                        : 0.0;
   for (;;) {
     const double time_tolerance = control->sampling ? control->sampling->time_tolerance(now.t) : 0.0;
     if (control->sampling && control->sampling->next_instant() <= now.t + time_tolerance)
@@ -105,20 +122,21 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
     if (control->sampling && control->sampling->next_instant() < until - time_tolerance)
       bound = control->sampling->next_instant();
     // not after a mere pause
-    if (bound + ahead != segment_end_) choose_explicit_method(bound + ahead), segment_end_ = bound + ahead;
-    if (const auto stop = prepare_step(bound + ahead)) return *stop;
+    if (bound + reach_beyond_ != segment_end_)
+      choose_explicit_method(bound + reach_beyond_), segment_end_ = bound + reach_beyond_;
+    if (const auto stop = prepare_step(bound + reach_beyond_)) return *stop;
     while (now.t < bound) {
       const double t_before = now.t;
-      if (const auto stop = make_step(bound + ahead, final && bound == until)) {
-        if (ahead == 0.0 || now.t != t_before || stop->reason == Stop::rhs_budget) return *stop;
-        ahead = 0.0, now.h = std::min(now.h, bound - now.t);  // the obstacle may lie beyond `bound`
+      if (const auto stop = make_step(bound + reach_beyond_, final && bound == until)) {
+        if (reach_beyond_ == 0.0 || now.t != t_before || stop->reason == Stop::rhs_budget) return *stop;
+        reach_beyond_ = 0.0, now.h = std::min(now.h, bound - now.t);  // the obstacle may lie beyond `bound`
         continue;
       }
       if (waiting_step_) return report_present(until);
       if (const auto stop = check_pace(until)) return *stop;
       const double seconds = elapsed();
       if (seconds > budget) return {Stop::wall_budget, now.t};
-      if (seconds > pause || work.rhs >= pause_at) return {Stop::pause, now.t};
+      if (seconds > pause || work.rhs >= pause_at) return is_paused_ = true, Stop{Stop::pause, now.t};
     }
   }
 }
@@ -154,7 +172,7 @@ std::optional<Stop> StepLoop::sample_control() {
   if (!system->sync_core(now.t, now.y)) return step_failure();
   system->core.set_velocity(system->v_tree);
   bool changed;
-  if (!control->sample(system->measured(now.t), changed) || !system->control_sampled(now.y, changed))
+  if (!control->sample(system->measured(now.t), changed) || (integrand && !integrand->control_sampled(now.y, changed)))
     return step_failure();
   if (changed) state_changed();
   return {};
@@ -169,7 +187,7 @@ std::optional<Stop> StepLoop::prepare_step(double bound) {
     if (!system->sync_core_at_start(now.t, now.y)) return step_failure();
     end_rank_ = monitor_.evaluate(*system);
     energy_.start_step(*system);
-    const Accepted accepted = system->accept_step(now.t, now.y, system->coordinate_margin());
+    const Accepted accepted = accept_state(now.t, now.y, system->coordinate_margin());
     if (accepted == Accepted::rejected) return Stop{Stop::coordinates_singular, now.t, system->coordinate_margin()};
     if (accepted != Accepted::unchanged) rate_is_known_ = false;
     state_is_accepted_ = true;
@@ -274,6 +292,11 @@ std::optional<Stop> StepLoop::make_crossing_step(double crossed_at, double remai
   return submit_step({&motion, crossed_at, after, system->coordinate_margin()}, bound, last);
 }
 
+Accepted StepLoop::accept_state(double t, Out y, double margin) {
+  if (integrand) integrand->accept_step(y);
+  return system->accept_step(t, y, margin);
+}
+
 // Find events and record outputs in a completed step, then make its end the present state.
 std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) {
   if (!is_repeating_ || system->core.joints.has_events()) {
@@ -295,7 +318,7 @@ std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) 
       return Stop{Stop::event, now.t};
     }
   }
-  const Accepted accepted = system->accept_step(now.t_new, now.y_new, step.margin);
+  const Accepted accepted = accept_state(now.t_new, now.y_new, step.margin);
   method_->accept_step();
   crossing_.accept_step(step.after);
   end_rank_ = step.after, energy_.accept_step();
@@ -340,8 +363,8 @@ bool StepLoop::record_now() { return recorder.add(*system, t(), y()); }
 std::optional<Stop> StepLoop::repeat_with_finer_tolerance() {
   const double until = now.t;
   reset_joints();
-  system->start(start_.t, start_.q_tree, start_.v_tree, start_.w, now.y);
-  now.t = now.t_old = start_.t, now.h = (until - now.t) / 10;
+  start_state();
+  now.t_old = now.t, now.h = (until - now.t) / 10;
   state_is_accepted_ = rate_is_known_ = false, last_step_size_ = 0.0;
   method_->reset_history();
   crossing_.reset();

@@ -49,8 +49,9 @@ struct Stop {
 
 class StepLoop {
  public:
-  StepLoop(std::unique_ptr<Control> control, std::unique_ptr<System> system, Options options,
-           std::vector<Event> events);
+  // `integrand`: null if nothing is integrated along with the motion.
+  StepLoop(std::unique_ptr<Control> control, std::unique_ptr<System> system, std::unique_ptr<Integrand> integrand,
+           Options options, std::vector<Event> events);
 
   // Start at t from a configuration with phi = w and velocity v'. Earlier runs have no influence.
   void start(double t, In q_tree, In v_tree, In w);
@@ -60,6 +61,7 @@ class StepLoop {
   // Advance to a time. `final`: the motion ends there. `pause`, `budget`: seconds until the next pause and until the
   // end of the budget. If the motion does not end and nothing has changed for several calls, the last step may reach
   // beyond `until`. The present state is then inside that step, and the step is discarded if something changes.
+  // A call with the same `until` after a pause continues as if there had been none.
   Stop advance(double until, bool final, double pause, double budget);
   // Present time and state.
   double t() const { return waiting_step_ ? t_present_ : now.t; }
@@ -71,6 +73,7 @@ class StepLoop {
 
   const std::unique_ptr<Control> control;
   const std::unique_ptr<System> system;
+  const std::unique_ptr<Integrand> integrand;
   Step now;
   Work work;
   Recorder recorder;
@@ -102,6 +105,8 @@ class StepLoop {
   std::optional<Stop> check_stiffness(double bound);
   std::optional<Stop> check_pace(double until);
   Stop report_present(double until);  // inside the waiting step
+  void start_state();          // of `start_`
+  Accepted accept_state(double t, Out y, double margin);
   void return_to_present();           // discards the waiting step
   std::optional<Stop> find_events(Interpolant& motion, bool last, double& stop_time);
   Stop event_failure();
@@ -159,7 +164,9 @@ class StepLoop {
   std::optional<CompletedStep> waiting_step_;  // such a step
   double target_ = 0.0, t_present_ = 0.0;      // requested time; present time inside that step
   Vector y_present_;
-  long advances_unchanged_ = 0;  // calls of `advance` since the last change
+  long advances_unchanged_ = 0;  // calls of `advance` since the last change, without those that continue after a pause
+  double reach_beyond_ = 0.0;    // s, how far a step may end beyond the requested time
+  bool is_paused_ = false;       // `advance` returned for a pause, and nothing has changed since
 };
 
 }  // namespace ckc

@@ -55,7 +55,7 @@ std::optional<Stop> StepLoop::check_joints() {
         !system->correct_locked_joints(now.y, options_.manifold_tolerance / 10, changed))
       return step_failure();
     if (changed) rate_is_known_ = false;
-    if (!system->stays_locked(tolerance_.atol)) return step_failure();
+    if (integrand && !integrand->stays_locked(tolerance_.atol)) return step_failure();
   }
   const int beyond =
       joints.find_joint_beyond_stop(system->core.q_tree, system->core.tree.q_index, stop_passed_tolerance);

@@ -43,7 +43,7 @@ Accepted PrintedSpf::accept_step(double, Out, double margin) {
   return margin > chart_margin ? Accepted::unchanged : Accepted::rejected;
 }
 
-bool PrintedSpf::rhs(double t, In y, Out y_dot) {
+bool PrintedSpf::motion_rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!y.allFinite()) return fail(RhsFailure::not_finite);
   set_state(t, y);

@@ -10,7 +10,6 @@ class PrintedSpf : public System {
   PrintedSpf(Core& core, Control& control, double epsilon, bool actual);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool rhs(double t, In y, Out y_dot) override;
   bool sync_core(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override { return sync_core(t, y); }
   double coordinate_margin() override { return phi_z_margin(); }
@@ -25,6 +24,7 @@ class PrintedSpf : public System {
   void add_displacement(Out, In) const override {}
 
  private:
+  bool motion_rhs(double t, In y, Out y_dot) override;
   void set_state(double t, In y);  // of the core; z_dot_ is evaluated at the actual phi
 
   const double epsilon_;

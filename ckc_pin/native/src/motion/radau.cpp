@@ -112,14 +112,14 @@ bool Radau::new_jacobian(double h) {
       y_stage_ = step_.y;
     ++work_.jacobians;
     if (system_.jacobian(step_.t + x * h, y_stage_, motion_block_.J, work_.rhs)) {
-      jacobian_is_valid_ = jacobian_is_fresh_ = true, factorized_step_ = 0.0;
       system_.rate_pairs(motion_block_.rates), motion_block_.update_indices();
-      if (const Matrix* J = system_.auxiliary_jacobian()) {
-        auxiliary_block_.J = *J, system_.auxiliary_rate_pairs(auxiliary_block_.rates),
-        auxiliary_block_.update_indices();
-        blocks_are_equal_ = auxiliary_block_.J.rows() == motion_block_.J.rows() &&
-                            auxiliary_block_.J == motion_block_.J && auxiliary_block_.rates == motion_block_.rates;
+      if (Integrand* integrand = system_.integrand) {
+        if (!integrand->jacobian(y_stage_, integrand_block_.J)) continue;
+        integrand->rate_pairs(integrand_block_.rates), integrand_block_.update_indices();
+        blocks_are_equal_ = integrand_block_.J.rows() == motion_block_.J.rows() &&
+                            integrand_block_.J == motion_block_.J && integrand_block_.rates == motion_block_.rates;
       }
+      jacobian_is_valid_ = jacobian_is_fresh_ = true, factorized_step_ = 0.0;
       return true;
     }
   }
@@ -166,17 +166,17 @@ void Radau::ShiftedBlock<Scalar>::solve(const Block& of, const Eigen::Ref<const 
 template <class Scalar>
 void Radau::Factors<Scalar>::compute(const Radau& of, Scalar shift) {
   motion.compute(of.motion_block_, shift);
-  if (of.auxiliary_block_.J.size() && !of.blocks_are_equal_) auxiliary.compute(of.auxiliary_block_, shift);
+  if (of.integrand_block_.J.size() && !of.blocks_are_equal_) integrand.compute(of.integrand_block_, shift);
 }
 
 template <class Scalar>
 void Radau::Factors<Scalar>::solve(const Radau& of, const Eigen::Ref<const typename ShiftedBlock<Scalar>::Column>& b,
                                    Eigen::Ref<typename ShiftedBlock<Scalar>::Column> x) {
-  const auto size = of.motion_block_.J.rows(), column = of.auxiliary_block_.J.rows();
+  const auto size = of.motion_block_.J.rows(), column = of.integrand_block_.J.rows();
   motion.solve(of.motion_block_, b.head(size), x.head(size));
   for (auto k = size; k < b.size(); k += column)
-    (of.blocks_are_equal_ ? motion : auxiliary)
-        .solve(of.blocks_are_equal_ ? of.motion_block_ : of.auxiliary_block_, b.segment(k, column),
+    (of.blocks_are_equal_ ? motion : integrand)
+        .solve(of.blocks_are_equal_ ? of.motion_block_ : of.integrand_block_, b.segment(k, column),
                x.segment(k, column));
 }
 

@@ -56,7 +56,7 @@ class Radau : public Method {
   Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1; one of each conjugate pair
   Eigen::VectorXcd lambda_;
 
-  // A diagonal block of the Jacobian: of the motion, or of one auxiliary column.
+  // A diagonal block of the Jacobian: of the motion, or of one column of the integrand.
   struct Block {
     Matrix J;
     std::vector<std::pair<int, int>> rates;  // (i, j): the rate of entry i is entry j
@@ -78,10 +78,10 @@ class Radau : public Method {
     void solve(const Block& of, const Eigen::Ref<const Column>& b, Eigen::Ref<Column> x);
   };
 
-  // The factorization for all of y. All auxiliary columns have the same block.
+  // The factorization for all of y. All columns of the integrand have the same block.
   template <class Scalar>
   struct Factors {
-    ShiftedBlock<Scalar> motion, auxiliary;
+    ShiftedBlock<Scalar> motion, integrand;
     void compute(const Radau& of, Scalar shift);
     void solve(const Radau& of, const Eigen::Ref<const typename ShiftedBlock<Scalar>::Column>& b,
                Eigen::Ref<typename ShiftedBlock<Scalar>::Column> x);
@@ -90,8 +90,8 @@ class Radau : public Method {
   Matrix Z_, F_, dZ_;
   Matrix Z_dot_, X_;  // rates of the polynomials at the stages, and of the full motion
   Vector b_, x_stage_;
-  Block motion_block_, auxiliary_block_;
-  bool blocks_are_equal_ = false;                  // the auxiliary block equals that of the motion
+  Block motion_block_, integrand_block_;
+  bool blocks_are_equal_ = false;                  // the integrand's block equals that of the motion
   Factors<double> real_factors_;                   // of the real eigenvalue
   std::vector<Factors<Complex>> complex_factors_;  // of the complex pairs
   Eigen::VectorXcd complex_rhs_, complex_correction_;

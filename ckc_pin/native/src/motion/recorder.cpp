@@ -22,7 +22,7 @@ static std::vector<RecordColumns> columns_of(const System& system) {
       {"lyapunov", 1},
       {"max_phi", 1},
       {"max_phi_dot", 1},
-      {"extra", system.extra_columns()},
+      {"extra", system.integrand ? system.integrand->record_size() : 0},
   };
   std::vector<RecordColumns> columns;
   Eigen::Index begin = 0;
@@ -74,7 +74,7 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
                                                              system.w_decay_rate() * system.w(i)));
   }
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
-  system.write_extra_columns(y, row.tail(system.extra_columns()));
+  if (system.integrand) system.integrand->fill_record(y, row.tail(width - at));
   return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }
 

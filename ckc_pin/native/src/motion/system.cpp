@@ -7,11 +7,25 @@ namespace ckc {
 
 constexpr double difference_step = 1.5e-8;  // step of forward differences: relative, or rad, m, and their rates
 
-System::System(Core& core_, Control& control_, int size_) : core(core_), control(control_), size(size_) {
+System::System(Core& core_, Control& control_, int motion_size_)
+    : core(core_), control(control_), motion_size(motion_size_), size(motion_size_) {
   velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.constraints.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
   applied_force_.setZero(core.n), zero_correction_.setZero(core.constraints.closure.rows),
       locked_drift_.setZero(core.n), locked_correction_.setZero(core.n);
+}
+
+void System::append(Integrand& appended) {
+  integrand = &appended, size = motion_size + appended.size();
+  crosses_singularities = false;  // there the columns have no limit
+}
+
+bool System::rhs(double t, In y, Out y_dot) {
+  return motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) && (!integrand || integrand->rates(y, y_dot));
+}
+
+bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  return motion_jacobian(t, y.head(motion_size), jacobian, evaluations);
 }
 
 const Vector& System::applied_force(In v) {
@@ -26,13 +40,15 @@ bool System::acceleration_with_held_joints(In v, In correction, Out a) {
 }
 
 bool System::acceleration_derivatives(In q_tree, In v, In correction) {
+  eq_1_is_valid_ = false;
   if (!control.is_active() && !core.joints.has_smooth_friction()) {  // nothing depends on the state
     force_.value = control.u_tree;
     force_.by_q.resize(0, 0), force_.by_v.resize(0, 0);
   } else if (!control.derivatives(core, force_.by_q, force_.by_v, force_.value)) {
     return false;
   }
-  return core.acceleration_derivatives(q_tree, v, correction, force_, eq_1_) || fail(RhsFailure::rank_lost);
+  eq_1_is_valid_ = core.acceleration_derivatives(q_tree, v, correction, force_, eq_1_);
+  return eq_1_is_valid_ || fail(RhsFailure::rank_lost);
 }
 
 bool System::acceleration(double t, Out a) {
@@ -79,8 +95,9 @@ double System::phi_z_margin() {
   return phi_z_singular_value_->value() / std::max(std::sqrt(square), 1e-300);
 }
 
-bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+bool System::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const auto size = y.size();
+  eq_1_is_valid_ = false;
   jacobian.resize(size, size), moved_rate_.resize(size), rate_at_y_.resize(size);
   moved_y_ = y;
   ++evaluations, ++counts.differences;

@@ -1,9 +1,11 @@
-// A formulation of the equations of motion as a first-order system y' = f(t, y).
+// A formulation of the equations of motion as a first-order system y' = f(t, y). An integrand, if there is one, has the
+// last entries of y.
 #pragma once
 
 #include "control/control.hpp"
 #include "loops/elimination_check.hpp"
 #include "loops/spectrum.hpp"
+#include "motion/integrand.hpp"
 
 namespace ckc {
 
@@ -38,15 +40,15 @@ enum class Accepted {
 
 class System {
  public:
-  System(Core& core, Control& control, int size);
+  System(Core& core, Control& control, int motion_size);
   virtual ~System() = default;
+  // Append an integrand to y. It has to live as long as this system.
+  void append(Integrand& integrand);
 
   // Start at t from a configuration with phi = w and velocity v' (rho q_dot, also off the manifold).
   virtual void start(double t, In q_tree, In v_tree, In w, Out y) = 0;
   // Compute y'. False if it does not exist or is not finite.
-  virtual bool rhs(double t, In y, Out y_dot) = 0;
-  // y' of the motion alone, without auxiliary columns.
-  virtual bool motion_rhs(double t, In y, Out y_dot) { return rhs(t, y, y_dot); }
+  bool rhs(double t, In y, Out y_dot);
   // Set the core and the members below to the state, projected as the formulation requires. False if that fails.
   virtual bool sync_core(double t, In y) = 0;
   // The same without projection, if possible.
@@ -68,15 +70,11 @@ class System {
   virtual Accepted accept_step(double t, Out y, double margin) = 0;
   // Return to the user's partition. False if its phi_z is singular.
   virtual bool restore_partition(double, Out, bool& changed) { return changed = false, true; }
-  // d rhs / d y of the motion. The default uses finite differences, counted in `evaluations`. False if one does not
-  // exist.
-  virtual bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
+  // Derivative of the motion's entries of y' with respect to those of y. Finite differences are counted in
+  // `evaluations`. False if it does not exist.
+  bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
   // Pairs (i, j) of entries of y where the rate of y(i) is y(j).
   virtual void rate_pairs(std::vector<std::pair<int, int>>& of) const = 0;
-  // The Jacobian of each auxiliary column with respect to itself, at the state of the last `jacobian`; null if there
-  // are none.
-  virtual const Matrix* auxiliary_jacobian() const { return nullptr; }
-  virtual void auxiliary_rate_pairs(std::vector<std::pair<int, int>>&) const {}
   // Duration of a boundary layer at the start of the motion, s.
   virtual double boundary_layer_time() const { return std::numeric_limits<double>::infinity(); }
   // Whether the motion conserves its energy without control, friction and damping.
@@ -88,6 +86,10 @@ class System {
   // `rhs` at y projected onto the constraint manifold to rounding, along all directions that J determines, however
   // weakly. False if the formulation cannot cross singular positions.
   virtual bool rate_on_manifold(double, In, Out) { return false; }
+  // Configuration of the last right-hand side. Its velocity is `v_tree`.
+  virtual const Vector& configuration_at_last_rhs() const { return core.q_tree; }
+  // Move the core and `v_tree` to the state y of the last right-hand side, if compiled terms have left them elsewhere.
+  virtual void move_core_to_last_rhs(In) {}
   // Acceleration of the tree at the last right-hand side. False if unknown.
   virtual bool tree_acceleration(In f, Out a) const = 0;
   // Called after a step was rejected because the full motion disagrees with its rates: forget all states since the
@@ -95,8 +97,6 @@ class System {
   virtual bool return_to_accepted() { return true; }
   // Size of the full motion (q', v') if y is only a part that determines it, else zero.
   virtual int full_motion_size() const { return 0; }
-  // Number of trailing entries of y that do not belong to the motion.
-  virtual int auxiliary_size() const { return 0; }
   // Longest step over which the full motion's rates can be integrated, s.
   virtual double full_motion_max_step() const { return std::numeric_limits<double>::infinity(); }
   // The full motion and its rate at the last right-hand side, f = rhs(t, y).
@@ -110,33 +110,15 @@ class System {
   const Vector& applied_force(In v);
   // Acceleration of the tree at the core's state, with holding forces on locked joints.
   bool acceleration(double t, Out a);
+  // Compute the derivatives of that acceleration; the core must be at this state, unless terms are compiled and no joint
+  // is locked. `correction` is added to J_dot v. False if the applied force has no known derivatives.
+  bool acceleration_derivatives(In q_tree, In v, In correction);
+  bool acceleration_derivatives(In q_tree, In v) { return acceleration_derivatives(q_tree, v, zero_correction_); }
+  // The derivatives that were computed last, without by_u; null if finite differences have taken their place since.
+  const AccelerationDerivatives* eq_1_derivatives() const { return eq_1_is_valid_ ? &eq_1_ : nullptr; }
   // Remove the drift of locked joints beyond `tolerance`, and their rates, from y, which is the core's state. False
   // if that fails.
   bool correct_locked_joints(Out y, double tolerance, bool& changed);
-  // --- sensitivities (sensitivity/sensitivity_system.hpp) ---
-  //
-  // A coordinate, or its rate, that arrives at a value where joint modes change. `stop`: at a stop, -1 for the lower
-  // one; its position may depend on parameters.
-  struct JointArrival {
-    int coordinate;
-    bool of_rate;
-    int stop = 0;
-  };
-  // Called at a transition of joint modes, at y, where the core is: before it, with the arrivals; in each round of an
-  // impact, which adds `step` to the velocities by impulses `x` on the coordinates `at`; and after it. False if the
-  // motion is not differentiable.
-  virtual bool before_transition(double, In, const std::vector<JointArrival>&) { return true; }
-  virtual bool at_impact(In, const Indices&, const Matrix&, In, double) { return true; }
-  virtual bool after_transition(double, Out, const std::vector<JointArrival>&, double, double) { return true; }
-  // At the end of an accepted step: whether locked joints stay locked for neighbouring parameter values.
-  virtual bool stays_locked(double) { return true; }
-  // After a sample at y, where the core is, or after a delayed output was applied. `changed`: whether integration has
-  // to restart. False if a derivative is unknown.
-  virtual bool control_sampled(In, bool&) { return true; }
-  // Number of additional columns of the record.
-  virtual int extra_columns() const { return 0; }
-  virtual void write_extra_columns(In, Out) {}  // the core is at y, with its control evaluated
-
   // Add to the velocities, and to the coordinates, in y.
   virtual void add_velocity(Out y, In v) const = 0;
   virtual void add_displacement(Out y, In step) const = 0;
@@ -145,7 +127,9 @@ class System {
 
   Core& core;
   Control& control;
-  int size;  // of y
+  const int motion_size;  // number of entries of y that describe the motion, the first ones
+  int size;               // number of all entries of y
+  Integrand* integrand = nullptr;
   Counts counts;
   EliminationCheck elimination;
   bool crosses_singularities = false;  // singular positions are crossed
@@ -162,18 +146,21 @@ class System {
   MeasuredState measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
 
  protected:
+  // `rhs` and `jacobian` of the motion. All arguments have the motion's entries only. The default Jacobian uses finite
+  // differences.
+  virtual bool motion_rhs(double t, In y, Out y_dot) = 0;
+  virtual bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations);
+
   bool fail(RhsFailure reason) { return failure = reason, false; }
   void partition_changed() { phi_z_singular_value_.reset(); }  // of the core
   // Eq. 1 at the core's state with velocity v, including holding forces. `correction` is added to J_dot v.
   bool acceleration_with_held_joints(In v, In correction, Out a);
-  // Compute eq_1_, the derivatives of that acceleration. The core must be at this state, unless
-  // terms are compiled and no joint is locked. False if the applied force has no known derivatives.
-  bool acceleration_derivatives(In q_tree, In v, In correction);
 
   Vector zero_correction_;        // zero, (rows)
-  AccelerationDerivatives eq_1_;  // at the last `jacobian` if that needed no differences; without by_u
+  AccelerationDerivatives eq_1_;
 
  private:
+  bool eq_1_is_valid_ = false;
   std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
   Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_;
   AppliedForce force_;

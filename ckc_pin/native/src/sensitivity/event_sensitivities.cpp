@@ -12,7 +12,7 @@ namespace ckc {
 constexpr double min_relative_tolerance = 1e-7, max_relative_tolerance = 1e-2, tolerance_factor = 100.0;
 constexpr double rate_rounding = 1e-9;  // of the fastest coordinate: below it a coordinate is at rest
 
-Vector Sensitivities::time_shift(const System::JointArrival& arrival, In v, In a, const Matrix& s) const {
+Vector Sensitivities::time_shift(const JointArrival& arrival, In v, In a, const Matrix& s) const {
   const int k = arrival.coordinate;
   if (arrival.of_rate) return -s.row(n + k) / a(k);
   return -distance_from_stop_derivative(arrival, s) / core_.tree.coordinate_change(core_.q_tree, k, v);
@@ -70,12 +70,12 @@ void Sensitivities::shift_time(In v, In a, double sign, Matrix& s) const {
 // Shift the sensitivities to the time of the event, which depends on the parameters. Of several simultaneous arrivals
 // the fastest one defines the time, and a stop takes precedence over coming to rest. Unconnected parts of the
 // mechanism have independent times: the order of their events does not matter.
-bool Sensitivities::before_transition(In v, In a, const std::vector<System::JointArrival>& arrivals, Matrix& s) {
+bool Sensitivities::before_transition(In v, In a, const std::vector<JointArrival>& arrivals, Matrix& s) {
   const Vector& reach = core_.joints.table.reach;
-  const auto speed = [&](const System::JointArrival& of) {
+  const auto speed = [&](const JointArrival& of) {
     return std::abs((of.of_rate ? a : v)(of.coordinate)) / reach(of.coordinate);
   };
-  const auto comes_later = [&](const System::JointArrival& x, const System::JointArrival& y) {
+  const auto comes_later = [&](const JointArrival& x, const JointArrival& y) {
     return x.of_rate == y.of_rate ? speed(x) < speed(y) : x.of_rate;
   };
   previous_direction_ = core_.joints.sliding_direction, previous_stop_side_ = core_.joints.stop_side;
@@ -85,8 +85,8 @@ bool Sensitivities::before_transition(In v, In a, const std::vector<System::Join
   if (!project_sensitivities(v, s)) return false;
   record_column_sizes(s);
   for (Eigen::Index part = 0; part < time_shift_.rows(); ++part) {
-    const System::JointArrival* first = nullptr;
-    for (const System::JointArrival& of : arrivals)
+    const JointArrival* first = nullptr;
+    for (const JointArrival& of : arrivals)
       if (table_.part[of.coordinate] == part && has_defined_time(of.coordinate, of.of_rate, v, a) &&
           (!first || comes_later(*first, of)))
         first = &of;
@@ -97,7 +97,7 @@ bool Sensitivities::before_transition(In v, In a, const std::vector<System::Join
 }
 
 // A joint that rests while another one changes its mode, or that has just reversed, does not change its mode.
-bool Sensitivities::mode_changed(const System::JointArrival& arrival) const {
+bool Sensitivities::mode_changed(const JointArrival& arrival) const {
   const Joints& joints = core_.joints;
   const int k = arrival.coordinate;
   const bool locked = joints.is_locked(k);
@@ -107,7 +107,7 @@ bool Sensitivities::mode_changed(const System::JointArrival& arrival) const {
 
 // Each parameter is compared with the largest norm that its column has had: digits lost there stay lost.
 std::optional<NonDifferentiableEvent> Sensitivities::find_non_differentiable(
-    const std::vector<System::JointArrival>& arrivals, const Matrix& s, double rtol, double atol) {
+    const std::vector<JointArrival>& arrivals, const Matrix& s, double rtol, double atol) {
   const double relative = std::clamp(tolerance_factor * rtol, min_relative_tolerance, max_relative_tolerance);
   record_column_sizes(s);
   for (const auto& [k, unreached] : unreached_rates_)
@@ -118,7 +118,7 @@ std::optional<NonDifferentiableEvent> Sensitivities::find_non_differentiable(
   if (before_first_transition_)
     for (int p = 0; p < count; ++p)
       if (const int k = table_.parameters[p].assembled_at; k >= 0) return NonDifferentiableEvent{{k, false}, p};
-  for (const System::JointArrival& arrival : arrivals) {
+  for (const JointArrival& arrival : arrivals) {
     if (!mode_changed(arrival)) continue;
     const double reach = core_.joints.table.reach(arrival.coordinate);
     const Vector offset =

@@ -206,7 +206,7 @@ void Sensitivities::closure_derivatives(In v, Matrix& phi_derivative, Matrix& ph
     }
 }
 
-Vector Sensitivities::distance_from_stop_derivative(const System::JointArrival& arrival, const Matrix& s) const {
+Vector Sensitivities::distance_from_stop_derivative(const JointArrival& arrival, const Matrix& s) const {
   Vector distance(count);
   for (int p = 0; p < count; ++p) {
     distance(p) = core_.tree.coordinate_change(core_.q_tree, arrival.coordinate, s.col(p));

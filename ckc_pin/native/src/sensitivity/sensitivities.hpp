@@ -75,7 +75,7 @@ struct NonDifferentiableEvent {
     restitution,        // joints that move only together are reflected by stops with different restitution
     marginally_locked,  // only rounding keeps the joint locked; for some parameter values it is released
   };
-  System::JointArrival arrival;
+  JointArrival arrival;
   int parameter;
   Reason reason = time;
 };
@@ -88,7 +88,7 @@ class Sensitivities {
   long compiled_evaluations = 0, general_evaluations = 0;  // number of evaluations by compiled terms and by Pinocchio's
   // Derivative of the time of an arrival with respect to each parameter, where the core moves with v and accelerates
   // with a.
-  Vector time_shift(const System::JointArrival& arrival, In v, In a, const Matrix& s) const;
+  Vector time_shift(const JointArrival& arrival, In v, In a, const Matrix& s) const;
   // at the last joint transition
   Vector time_shift(int coordinate) const { return time_shift_.row(table_.part[coordinate]); }
   // Initialize s from the initial sensitivities of the independent coordinates. False if the start is singular.
@@ -113,13 +113,13 @@ class Sensitivities {
   // be restarted, which may be so even if u is unchanged.
   bool control_sampled(const Matrix& s, const Sampling& clock, bool& changed);
   bool has_held_output() const { return held_output_.size() && !held_output_.isZero(0.0); }
-  // Transitions of joint modes, called as those of System. In between, s belongs to the parameter-dependent time of
+  // Transitions of joint modes, called as those of Integrand. In between, s belongs to the parameter-dependent time of
   // the event. An impact may have several rounds, each starting at velocity v.
-  bool before_transition(In v, In a, const std::vector<System::JointArrival>& arrivals, Matrix& s);
+  bool before_transition(In v, In a, const std::vector<JointArrival>& arrivals, Matrix& s);
   bool at_impact(In v, In step, const Indices& at, const Matrix& responses, In x, double restitution, Matrix& s);
   bool project_sensitivities(In v, Matrix& s);
   // Find the first arrival whose time depends on a parameter differently than the event's time. Requires projected s.
-  std::optional<NonDifferentiableEvent> find_non_differentiable(const std::vector<System::JointArrival>& arrivals,
+  std::optional<NonDifferentiableEvent> find_non_differentiable(const std::vector<JointArrival>& arrivals,
                                                                 const Matrix& s, double rtol, double atol);
   void after_transition(In v, In a, Matrix& s);
   // Find a joint that only rounding has kept locked since the last step, and a parameter that changes its force: for
@@ -154,48 +154,49 @@ class Sensitivities {
   void limited_motor_sensitivities(In v);  // sets limited_tau_
   void add_state_derivatives(const Matrix& s);
   void add_tree_force(Out force) const;  // maps tree_force_ to the mechanism's coordinates
-  Vector distance_from_stop_derivative(const System::JointArrival& arrival, const Matrix& s) const;  // by parameter
+  Vector distance_from_stop_derivative(const JointArrival& arrival, const Matrix& s) const;  // by parameter
   bool has_defined_time(int coordinate, bool of_rate, In v, In a) const;  // it moves faster than rounding
-  bool mode_changed(const System::JointArrival& arrival) const;           // since `before_transition`
+  bool mode_changed(const JointArrival& arrival) const;           // since `before_transition`
   void shift_time(In v, In a, double sign, Matrix& s) const;
-  double column_norm(const Eigen::Ref<const Matrix>& s, int p) const;
+  double column_norm(const Eigen::Ref<const Matrix>& s, int p) const;  // in units of the joints' reach
 
   System& system_;
   Core& core_;
   const SensitivityTable table_;
   Tree tree_;
   DynamicsDerivatives derivatives_;
-  bool has_applied_derivatives_ = false;  // in units of the joints' reach
-  bool has_feedback_ = false;             // some parameter acts through friction, motors or controllers
+  bool has_applied_derivatives_ = false;  // some parameter acts through friction, motors or controllers
+  bool has_feedback_ = false;             // the applied force depends on the state
   Matrix u_by_q_, u_by_v_, force_, row_, derivative_, responses_, compensation_, limited_tau_, requested_u_;
-  Matrix gear_force_;      // the applied force depends on the state
-  struct DirectionGroup {  // change of the motors' force due to their transmissions
+  Matrix gear_force_;  // derivative of the motors' force through their transmissions
+  // Parameters that the compiled code processes together, one row each.
+  struct DirectionGroup {
     int first, count;
     Matrix directions, derivatives;
   };
   bool torque_pole_ = false;
-  Indices torque_limit_side_;  // parameters that the compiled code processes together, one row each
+  Indices torque_limit_side_;  // by motor, at the last accepted state: -1, 1, or 0 for none
   std::vector<DirectionGroup> direction_groups_;
-  // by motor: side of the limit at the last accepted state: -1, 1, or 0 for none
-  std::vector<Indices> parameter_groups_;
+  std::vector<Indices> parameter_groups_;  // by parameter: groups of the compiled terms' parameters
   struct Gain {
     int parameter;
-    Matrix of_q, of_q_dot;  // by parameter: groups of the compiled terms' parameters
+    Matrix of_q, of_q_dot;  // change of K_P or Lambda, and of K_V or K_D
   };
   std::vector<Gain> gains_;
-  std::deque<Matrix> queued_;  // change of K_P or Lambda, and of K_V or K_D
+  std::deque<Matrix> queued_;  // sensitivities of samples that do not act yet
   Matrix held_output_;
   Vector applied_force_, locked_correction_, direction_, group_direction_, tree_force_, lambda_, residual_force_;
   Vector q_, v_, a_, fixed_q_, fixed_q_dot_, u_derivative_;
-  Matrix time_shift_;                                    // sensitivities of samples that do not act yet
-  Vector largest_norm_;                                  // (parts, parameters)
-  bool before_first_transition_ = true;                  // by parameter: largest norm of its column so far
-  Indices previous_direction_, previous_stop_side_;      // no joint transition has occurred yet
-  std::vector<std::pair<int, Vector>> unreached_rates_;  // modes before the transition
-  // by coordinate: what impacts should add to its rate but cannot, by parameter
-  Matrix free_derivative_, locked_force_derivative_;
-  std::vector<char> was_at_limit_;  // derivatives of the acceleration without holding forces, and of the holding forces
-  std::vector<char> was_locked_, was_struck_;  // (n): joints that only rounding kept locked after the last step
+  Matrix time_shift_;                                // (parts, parameters)
+  Vector largest_norm_;                              // by parameter: largest norm of its column so far
+  bool before_first_transition_ = true;              // no joint transition has occurred yet
+  Indices previous_direction_, previous_stop_side_;  // joint modes before the transition
+  // By coordinate: what impacts should add to its rate but cannot, by parameter.
+  std::vector<std::pair<int, Vector>> unreached_rates_;
+  Matrix free_derivative_;                     // of the acceleration without holding forces, by parameter
+  Matrix locked_force_derivative_;             // of the holding forces, by parameter
+  std::vector<char> was_at_limit_;             // (n): joints that only rounding kept locked after the last step
+  std::vector<char> was_locked_, was_struck_;  // (n): before the transition; by its impacts
 };
 
 }  // namespace ckc
