@@ -15,7 +15,6 @@ from ckc_pin.cli import options
 from ckc_pin.cli.output import (
     ProgressBar,
     Spinner,
-    create_table,
     error_console,
     exit_unless_done,
     format_destination,
@@ -29,15 +28,11 @@ from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
 
 if TYPE_CHECKING:
-    from rich.console import Group
-
-    from ckc_pin.base.arrays import Array
     from ckc_pin.linear.linearize import At
 
 __all__ = ["inverse", "linearize", "map_", "sensitivities"]
 
 MODEL_FILES = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # of an earlier model; not all are written again
-MOMENT_TOLERANCE = 1e-9  # of the force times the mechanism's size: a smaller moment is not printed
 
 
 # --- inverse -------------------------------------------------------------------------------------
@@ -72,7 +67,7 @@ def inverse(what: str, overrides: tuple[str, ...], out: Path | None, figures: bo
     if as_json:
         print_json(forces.to_dict())
     else:
-        print_table(_format_forces(forces))
+        print_summary(forces.summary())
         print(format_destination(out, "inverse.npz, for other programs"))
     exit_unless_done(forces.status, forces.message)
 
@@ -88,41 +83,6 @@ def _save_forces(forces: ckc_pin.MotionForces, out: Path, figures: bool) -> None
 
             with skip_figures_without_matplotlib():
                 save_motion_forces(forces, out)
-
-
-def _format_forces(forces: ckc_pin.MotionForces) -> Group:
-    """Return a table of the largest efforts and loop forces with their times, followed by the message."""
-    import numpy as np
-    from rich.console import Group
-    from rich.text import Text
-
-    from ckc_pin.mechanism.units import motor_units
-
-    table = create_table("of the motion", right=("largest", "at t (s)"))
-    table.add_column("limit")
-    exceeded = {entry["motor"]: entry for entry in forces.exceeded}
-    for k, (motor, unit) in enumerate(zip(forces.actuated, motor_units(forces.mechanism), strict=True)):
-        limit = forces.limit[k]
-        text = f"{limit:.4g} {unit}" if np.isfinite(limit) else ""
-        if motor in exceeded:
-            text += f", exceeded from t = {exceeded[motor]['t']:.4g} s on"
-        table.add_row(f"motor {motor}", *_format_largest(forces.t, np.abs(forces.tau[:, k]), unit), text)
-    for loop, multipliers in forces.loop_forces.items():
-        if loop not in forces.loop_wrenches:
-            table.add_row(f"coupling {loop}", *_format_largest(forces.t, np.abs(multipliers[:, 0]), ""))
-            continue
-        wrench = forces.loop_wrenches[loop]
-        force, moment = np.linalg.norm(wrench[:, :3], axis=1), np.linalg.norm(wrench[:, 3:], axis=1)
-        if force.any() or not moment.any():
-            table.add_row(f"loop {loop}", *_format_largest(forces.t, force, "N"))
-        if moment.max() > MOMENT_TOLERANCE * forces.mechanism.size * force.max():
-            table.add_row(f"loop {loop}, moment", *_format_largest(forces.t, moment, "N m"))
-    return Group(table, Text(forces.message))
-
-
-def _format_largest(t: Array, values: Array, unit: str) -> tuple[str, str]:
-    k = int(values.argmax())
-    return f"{values[k]:.4g} {unit}", f"{t[k]:.4g}"
 
 
 # --- linearize -----------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mappi
             return _Subject(load(what), None)
         what = load_scene(what, overrides)
     elif overrides:
-        raise InputError("linearize: overrides go with a name; a Scene or a Mechanism is complete")
+        raise InputError("linearize: overrides are accepted only with a name or path, not with a Scene or a Mechanism")
     return _Subject(load_scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
 
 

@@ -112,7 +112,7 @@ def gain_locus(
             return None
         what = load_scene(what, overrides)
     elif overrides:
-        raise InputError("gain_locus: overrides go with a name; a Scene is complete")
+        raise InputError("gain_locus: overrides are accepted only with the name or path of a scene, not with a Scene")
     mechanism = load_scene_mechanism(what)
     law = build_scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):

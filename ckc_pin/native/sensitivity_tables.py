@@ -112,7 +112,7 @@ class SensitivityParameter:
     Attributes
     ----------
     name : str
-    effects : tuple of ParameterDerivative
+    derivatives : tuple of ParameterDerivative
     q : (n,) array or None
         Derivative of the initial configuration, as a tangent vector.
     q_dot : (d,) array or None
@@ -127,7 +127,7 @@ class SensitivityParameter:
     """
 
     name: str
-    effects: tuple[ParameterDerivative, ...] = ()
+    derivatives: tuple[ParameterDerivative, ...] = ()
     q: Array | None = None
     q_dot: Array | None = None
     placements: tuple[ParameterDerivative, ...] = ()
@@ -154,9 +154,11 @@ def argument_directions(
     numbers = model_numbers(mechanism)
     which = present(numbers)
     for x in parameters:
-        if any(effect.placement is not None and effect.placement.revolute for effect in x.effects):
+        if any(derivative.placement is not None and derivative.placement.revolute for derivative in x.derivatives):
             return None
-        if any(effect.kind == "inertia" and numbers["mass"][effect.index] <= 0.0 for effect in x.effects):
+        if any(
+            derivative.kind == "inertia" and numbers["mass"][derivative.index] <= 0.0 for derivative in x.derivatives
+        ):
             return None
         for key in numbers:
             if key in x.slopes:
@@ -194,7 +196,9 @@ def sensitivity_table(
         There is a controller, whose output may depend on every joint.
     """
     tree = mechanism.tree
-    placements = _PlacementJoints([effect for x in parameters for effect in x.effects if effect.placement is not None])
+    placements = _PlacementJoints(
+        [derivative for x in parameters for derivative in x.derivatives if derivative.placement is not None]
+    )
     model = pin.Model()
     model.gravity.linear = tree.model.gravity.linear
     tables = core_table(mechanism)
@@ -232,13 +236,13 @@ def sensitivity_table(
     for key in ("joint_stiffness", "joint_rest", "joint_damping", "constant"):
         springs[key] = _scatter_columns(springs[key], real_v, model.nv)
 
-    def native_derivative(effect: ParameterDerivative) -> tuple[_core.ParameterDerivativeKind, int, Array]:
-        index = effect.index
-        if effect.placement is not None:
-            index = model.joints[placements.joint[id(effect)]].idx_v
-        elif effect.kind == "inertia":
+    def native_derivative(derivative: ParameterDerivative) -> tuple[_core.ParameterDerivativeKind, int, Array]:
+        index = derivative.index
+        if derivative.placement is not None:
+            index = model.joints[placements.joint[id(derivative)]].idx_v
+        elif derivative.kind == "inertia":
             index = joint_at[index]
-        return _core.ParameterDerivativeKind[effect.kind.upper()], index, effect.values
+        return _core.ParameterDerivativeKind[derivative.kind.upper()], index, derivative.values
 
     return {
         "model": packed(model),
@@ -252,7 +256,7 @@ def sensitivity_table(
         "target": target,
         "transmission": np.asfortranarray(mechanism.motors.transmission),
         "parameters": [
-            ([native_derivative(effect) for effect in x.effects], np.zeros(tree.n) if x.q is None else x.q,
+            ([native_derivative(derivative) for derivative in x.derivatives], np.zeros(tree.n) if x.q is None else x.q,
              np.zeros(mechanism.d) if x.q_dot is None else x.q_dot, x.assembled_at)
             for x in parameters
         ],
@@ -296,29 +300,29 @@ def separate_parts(mechanism: Mechanism) -> list[int]:
 class _PlacementJoints:
     """Add the locked joints of placement parameters to a model: a chain if several parameters place one object."""
 
-    def __init__(self, effects: Sequence[ParameterDerivative]) -> None:
-        self._effects = effects
-        self.joint: dict[int, int] = {}  # by id of the effect
+    def __init__(self, derivatives: Sequence[ParameterDerivative]) -> None:
+        self._derivatives = derivatives
+        self.joint: dict[int, int] = {}  # by id of the derivative
         self.ends: dict[tuple[PlacedKind, int], int] = {}  # last joint of a chain, by placed object; without joints
 
     def add(self, model: Any, placed: tuple[PlacedKind, int], parent: int) -> int:
         """Add the joints of one placed object; return the joint that carries it."""
-        for effect in self._effects:
-            placement = effect.placement
+        for derivative in self._derivatives:
+            placement = derivative.placement
             assert placement is not None
-            if (placement.placed, effect.index) == placed:
+            if (placement.placed, derivative.index) == placed:
                 kind = pin.JointModelRevoluteUnaligned if placement.revolute else pin.JointModelPrismaticUnaligned
                 name = f"lock {len(self.joint)}"
                 parent = int(model.addJoint(parent, kind(np.array(placement.axis)), pin.SE3.Identity(), name))
-                self.joint[id(effect)] = parent
+                self.joint[id(derivative)] = parent
         return parent
 
     def add_ends(self, model: Any, joint: int, at: int) -> None:
         """Add the joints of the points, directions and spring ends that one joint carries."""
-        for effect in self._effects:
-            placement = effect.placement
+        for derivative in self._derivatives:
+            placement = derivative.placement
             assert placement is not None
-            placed = (placement.placed, effect.index)
+            placed = (placement.placed, derivative.index)
             if placement.placed != "joint" and placement.carrier == joint and placed not in self.ends:
                 self.ends[placed] = self.add(model, placed, at)
 

@@ -12,12 +12,14 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic
-from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
+from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.units import motor_units
 from ckc_pin.run.run import Status
 
 __all__ = ["MotionForces", "collect_forces"]
 
+MOMENT_TOLERANCE = 1e-9  # of the force times the mechanism's size: a smaller moment is not printed
 LIMIT_TOLERANCE = 1e-9  # relative to a limit: a torque clipped at its limit may exceed it by rounding
 
 
@@ -70,16 +72,30 @@ class MotionForces(HasSummary):
 
     def summary(self) -> Summary:
         """Return a one-screen summary: largest motor torques, names of loops and joints, exceeded limits."""
-        rows: list[Row] = [
-            ("instants", f"{len(self.t)}, from t = {self.t[0]:g} to {self.t[-1]:g} s"),
-            ("largest |tau|", format_quantities(self.actuated, np.abs(self.tau).max(axis=0))),
-            ("loop_forces", list(self.loop_forces)),
-            ("joint_forces", list(self.joint_forces)),
-        ]
-        for x in self.exceeded:
-            peak = f"{x['motor']}: {x['most']:.4g} at t = {x['t_most']:.4g} s"
-            rows.append(("exceeded", f"{peak}, its limit is {x['limit']:.4g}"))
+        rows: list[Row] = [("instants", f"{len(self.t)}, from t = {self.t[0]:g} to {self.t[-1]:g} s")]
+        exceeded = {entry["motor"]: entry for entry in self.exceeded}
+        for k, (motor, unit) in enumerate(zip(self.actuated, motor_units(self.mechanism), strict=True)):
+            items = [self._format_largest(np.abs(self.tau[:, k]), unit)]
+            if np.isfinite(self.limit[k]):
+                onset = f", exceeded from t = {exceeded[motor]['t']:.4g} s on" if motor in exceeded else ""
+                items.append(f"limit {self.limit[k]:.4g} {unit}{onset}")
+            rows.append((f"motor {motor}", items))
+        for loop, multipliers in self.loop_forces.items():
+            if loop not in self.loop_wrenches:
+                rows.append((f"coupling {loop}", self._format_largest(np.abs(multipliers[:, 0]), "")))
+                continue
+            wrench = self.loop_wrenches[loop]
+            force, moment = np.linalg.norm(wrench[:, :3], axis=1), np.linalg.norm(wrench[:, 3:], axis=1)
+            if force.any() or not moment.any():
+                rows.append((f"loop {loop}", self._format_largest(force, "N")))
+            if moment.max() > MOMENT_TOLERANCE * self.mechanism.size * force.max():
+                rows.append((f"loop {loop}, moment", self._format_largest(moment, "N m")))
+        rows.append(("joint_forces", list(self.joint_forces)))
         return Summary(f"MotionForces of {self.name}, {self.status}: {self.message}", rows)
+
+    def _format_largest(self, sizes: Array, unit: str) -> str:
+        k = int(sizes.argmax())
+        return f"at most {f'{sizes[k]:.4g} {unit}'.rstrip()} at t = {self.t[k]:.4g} s"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON of `ckc inverse` (docs/reference/json.md): all arrays as lists, forces by name."""

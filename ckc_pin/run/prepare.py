@@ -36,7 +36,7 @@ from ckc_pin.scene.parts import (
 from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
 
-__all__ = ["DerivativeSetup", "ParameterDerivatives", "Prepared", "prepare"]
+__all__ = ["Prepared", "SensitivitySetup", "SetUpSensitivities", "prepare"]
 
 # A right-hand side is evaluated this close to the constraint manifold, relative to rtol and the mechanism's size.
 CLOSURE_TOLERANCE = 3e-3
@@ -48,8 +48,8 @@ COLLOCATION_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
-class ParameterDerivatives:
-    """Tables for the native loop to integrate derivatives of a motion with respect to parameters.
+class SensitivitySetup:
+    """Tables with which the native loop integrates sensitivities of a motion.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class ParameterDerivatives:
     table : dict
         The entry "sensitivities" of the formulation's table.
     parameter_library : Library or None
-        Compiled terms that have these derivatives.
+        Compiled terms with derivatives with respect to these parameters.
     missing_arguments : dict of str to bool arrays, or None
         Arguments that a library needs for these derivatives. None if there is such a library, or if there can be none.
     """
@@ -68,8 +68,8 @@ class ParameterDerivatives:
     missing_arguments: dict[str, BoolArray] | None
 
 
-class DerivativeSetup(Protocol):
-    """Builds the parameter derivatives of a scene that is being prepared."""
+class SetUpSensitivities(Protocol):
+    """Builds the tables of sensitivities of a scene that is being prepared."""
 
     def __call__(
         self,
@@ -78,8 +78,8 @@ class DerivativeSetup(Protocol):
         controller: Controller | TorqueController | Sampled | None,
         actuation: Actuation,
         start: Start,
-    ) -> ParameterDerivatives:
-        """Return the parameter derivatives (InputError: the motion has no known derivatives)."""
+    ) -> SensitivitySetup:
+        """Return the tables (InputError: the motion has no known derivatives)."""
         ...
 
 
@@ -103,8 +103,8 @@ class Prepared:
     tables : tuple
         Arguments of the native loop: core, formulation, control, solver, events.
     loop : _core.Loop
-    derivatives : ParameterDerivatives or None
-        Set if derivatives of the motion are integrated with it.
+    sensitivities : SensitivitySetup or None
+        Set if sensitivities are integrated with the motion.
     """
 
     scene: Scene
@@ -117,12 +117,12 @@ class Prepared:
     texts: dict[str, str]
     tables: tuple[Any, ...]
     loop: _core.Loop
-    derivatives: ParameterDerivatives | None = None
+    sensitivities: SensitivitySetup | None = None
 
     @property
     def missing_arguments(self) -> dict[str, BoolArray] | None:
         """Arguments that a library of compiled terms needs for the parameter derivatives, if there is none yet."""
-        return self.derivatives.missing_arguments if self.derivatives else None
+        return self.sensitivities.missing_arguments if self.sensitivities else None
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Set the loop to a start at time t (s), by default the scene's, and discard its history.
@@ -150,7 +150,7 @@ def prepare(
     free: bool = False,
     profile: bool = False,
     library: Library | None = None,
-    derivatives: DerivativeSetup | None = None,
+    set_up_sensitivities: SetUpSensitivities | None = None,
 ) -> Prepared:
     """Build everything that a scene needs before its first step.
 
@@ -167,8 +167,8 @@ def prepare(
         Count the terms that are evaluated.
     library : Library, optional
         Compiled terms to use instead of those that solver.terms selects.
-    derivatives : DerivativeSetup, optional
-        Builds the parameter derivatives that are integrated with the motion.
+    set_up_sensitivities : SetUpSensitivities, optional
+        Builds the tables of sensitivities that are integrated with the motion.
 
     Raises
     ------
@@ -190,17 +190,17 @@ def prepare(
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
-    parameter_derivatives = None
-    if derivatives is not None:
-        parameter_derivatives = derivatives(scene, mechanism, controller, actuation, start)
-        library = parameter_derivatives.parameter_library
-        formulation["sensitivities"] = parameter_derivatives.table
+    sensitivities = None
+    if set_up_sensitivities is not None:
+        sensitivities = set_up_sensitivities(scene, mechanism, controller, actuation, start)
+        library = sensitivities.parameter_library
+        formulation["sensitivities"] = sensitivities.table
     with scene.sources.prefix_errors():
         control = control_table(
             controller,
             actuation,
             partial(wrap_controller, mechanism=mechanism),
-            differentiates=parameter_derivatives is not None,
+            differentiates=sensitivities is not None,
         )
     library = library or select_library(mechanism, scene.spec.solver.terms)
     tables = (
@@ -221,7 +221,7 @@ def prepare(
         texts={**mechanism.sources.texts, **scene.sources.texts, **texts},
         tables=tables,
         loop=_core.Loop(*tables),
-        derivatives=parameter_derivatives,
+        sensitivities=sensitivities,
     )
 
 

@@ -26,7 +26,7 @@ from ckc_pin.run.simulate import Progress, simulate
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
-from ckc_pin.sensitivity.parameters import derivatives_of
+from ckc_pin.sensitivity.parameters import sensitivity_setup
 from ckc_pin.sensitivity.sensitivities import sensitivities
 
 __all__ = ["Floquet", "floquet"]
@@ -178,7 +178,7 @@ def floquet(
     parameters = [f"initial.{quantity}.{name}" for quantity in ("q", "q_dot") for name in names]
     try:
         # A scene without supported derivatives is rejected before anything is run.
-        prepare(scene, derivatives=derivatives_of(parameters))
+        prepare(scene, set_up_sensitivities=sensitivity_setup(parameters))
     except InputError as error:
         raise InputError(f"floquet: {str(error).removeprefix('sensitivities: ')}") from None
     # The motion alone is checked first, because the variational equations cost 2 d times as much.

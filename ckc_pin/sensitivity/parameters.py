@@ -1,7 +1,7 @@
 """Parameters for which sensitivities can be computed, by name: `link.rod.mass`, `initial.q.theta_1`.
 
-`mechanism.parameters` defines the names of the mechanism's parameters, and `sensitivity.effects` their effects. The
-gains of the controller and the start are parameters of the scene.
+`mechanism.parameters` defines the names of the mechanism's parameters, and `parameter_derivatives` computes how they
+act. The gains of the controller and the start are parameters of the scene.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from ckc_pin.native.sensitivity_tables import (
     sensitivity_table,
 )
 from ckc_pin.run.compiled_terms import select_derivative_library
-from ckc_pin.run.prepare import DerivativeSetup, ParameterDerivatives
+from ckc_pin.run.prepare import SensitivitySetup, SetUpSensitivities
 from ckc_pin.scene.initial import Start
 from ckc_pin.scene.parts import rebuild_scene_mechanism
 from ckc_pin.scene.scene import Scene
-from ckc_pin.sensitivity.effects import effects_of
+from ckc_pin.sensitivity.parameter_derivatives import find_parameter_derivatives
 
-__all__ = ["derivatives_of", "find_sensitivity_parameters"]
+__all__ = ["find_sensitivity_parameters", "sensitivity_setup"]
 
 MOBILITY_STEP = 1e-3  # rad, or relative to the mechanism's size; the mechanism must still move after such a step
 STOP_STEP = 1e-7  # the same; the assembled start follows a stop if it moves with such a step of the stop
@@ -60,8 +60,8 @@ STEPS_AT_STOP = (1e-4, 1e-5, 1e-6)  # the same, if the start is at the stop
 SCENE_ROOTS = ("controller", "initial")
 
 
-def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
-    """Return the function with which `prepare` sets up the derivatives with respect to some parameters."""
+def sensitivity_setup(names: Sequence[str]) -> SetUpSensitivities:
+    """Return the function with which `prepare` sets up the sensitivities to some parameters."""
 
     def setup(
         scene: Scene,
@@ -69,7 +69,7 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
         controller: Controller | TorqueController | Sampled | None,
         actuation: Actuation,
         start: Start,
-    ) -> ParameterDerivatives:
+    ) -> SensitivitySetup:
         overrides, rebuild = scene.spec.parameters, partial(rebuild_scene_mechanism, scene)
         law = controller.controller if isinstance(controller, Sampled) else controller
         parameters = find_sensitivity_parameters(mechanism, scene, law, actuation, names, rebuild, start.at.q_tree)
@@ -83,7 +83,7 @@ def derivatives_of(names: Sequence[str]) -> DerivativeSetup:
             mechanism, parameters, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=find_compensated_target(mechanism, law), controlled=controller is not None,
         )  # fmt: skip
-        return ParameterDerivatives(tuple(parameters), table, library, arguments if library is None else None)
+        return SensitivitySetup(tuple(parameters), table, library, arguments if library is None else None)
 
     return setup
 
@@ -122,7 +122,9 @@ def require_supported_scene(
         raise InputError("sensitivities support starts on phi = 0 only; remove initial.w")
     if spec.formulation == "dae" and (spec.solver.baumgarte or not spec.solver.projection):
         raise InputError("sensitivities need closed loops; remove solver.baumgarte, and set solver.projection = true")
-    shaping = next((x.name for x in parameters if any(effect.changes_closure for effect in x.effects)), None)
+    shaping = next(
+        (x.name for x in parameters if any(derivative.changes_closure for derivative in x.derivatives)), None
+    )
     if shaping is not None and type(controller) is Tracking and isinstance(controller.desired, PointPath):
         raise InputError(
             f"sensitivities: {shaping}: the controller makes a point follow a path, so q_d depends on the mechanism's "
@@ -137,12 +139,14 @@ def require_supported_scene(
         # Joints that cannot move have no stick-slip events, so their friction needs no monitor.
         frictionless = (mechanism.joints.friction == 0) & ~mechanism.freedoms.immobile
         for x in parameters:
-            if any(contribution.kind == "friction" and frictionless[contribution.index] for contribution in x.effects):
+            if any(
+                contribution.kind == "friction" and frictionless[contribution.index] for contribution in x.derivatives
+            ):
                 raise InputError(
                     f"sensitivities: {x.name} is 0, so stick-slip events are not monitored; give a small value, "
                     f"{x.name} = 1e-6 in [parameters], or friction_smoothing"
                 )
-    plant = [x.name for x in parameters if any(effect.changes_terms for effect in x.effects)]
+    plant = [x.name for x in parameters if any(derivative.changes_terms for derivative in x.derivatives)]
     if type(controller) is Tracking and controller.model is None and plant:
         raise InputError(
             f"sensitivities: {plant[0]}: tracking computes u from the mechanism's terms, whose derivatives are not "
@@ -181,7 +185,7 @@ def require_movable(
         return
     present = values_of(mechanism.spec, mechanism.urdf)
     for x in parameters:
-        if not any(effect.changes_closure for effect in x.effects):
+        if not any(derivative.changes_closure for derivative in x.derivatives):
             continue
         whole, k = split_component(x.name)
         value = present[whole]
@@ -218,7 +222,7 @@ def at_assembled_stop(
     InputError
         q_guess is beyond the stop, so the start follows the stop in both directions.
     """
-    stop = next((contribution for contribution in x.effects if contribution.kind in ("lower", "upper")), None)
+    stop = next((contribution for contribution in x.derivatives if contribution.kind in ("lower", "upper")), None)
     if stop is None:
         return x
     k, reach = stop.index, mechanism.tree.step_scale
@@ -293,14 +297,14 @@ def find_sensitivity_parameters(
 def _mechanism_parameter(
     mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
 ) -> SensitivityParameter:
-    """Return a parameter of the mechanism. Effects on reported points only do not act on the motion."""
-    effects = effects_of(mechanism, actuation, name, slopes)
-    placed = ["" if effect.placement is None else effect.placement.placed for effect in effects]
-    by_place = list(zip(placed, effects, strict=True))
+    """Return a parameter of the mechanism. Derivatives of reported points only do not act on the motion."""
+    derivatives = find_parameter_derivatives(mechanism, actuation, name, slopes)
+    placed = ["" if derivative.placement is None else derivative.placement.placed for derivative in derivatives]
+    by_place = list(zip(placed, derivatives, strict=True))
     return SensitivityParameter(
         name,
-        tuple(effect for place, effect in by_place if place != "reported"),
-        placements=tuple(effect for place, effect in by_place if place in ("joint", "reported")),
+        tuple(derivative for place, derivative in by_place if place != "reported"),
+        placements=tuple(derivative for place, derivative in by_place if place in ("joint", "reported")),
         slopes=slopes,
     )
 

@@ -28,7 +28,7 @@ from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import Progress, build_run, record_rows
 from ckc_pin.scene.scene import Scene, as_scene
-from ckc_pin.sensitivity.parameters import derivatives_of
+from ckc_pin.sensitivity.parameters import sensitivity_setup
 
 __all__ = ["Sensitivities", "compute_point_sensitivities", "sensitivities"]
 
@@ -53,7 +53,7 @@ class Sensitivities(HasSummary):
     end_time : (p,) array or None
         Derivative of the time of the event that ended the run, s; None if no such event did.
     sensitivity_parameters : tuple of SensitivityParameter
-        The effects of the parameters.
+        How each parameter acts.
     """
 
     run: Run
@@ -233,7 +233,7 @@ def sensitivities(
         require_type(name, str, "sensitivities: parameters", EXPECTED_NAMES)
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
-    ready = prepare(scene, controller, events, derivatives=derivatives_of(tuple(parameters)))
+    ready = prepare(scene, controller, events, set_up_sensitivities=sensitivity_setup(tuple(parameters)))
     started = perf_counter()
     try:
         rows, status, message = record_rows(ready, progress)
@@ -254,7 +254,7 @@ def sensitivities(
 
 
 def _sensitivity_parameters(ready: Prepared) -> tuple[SensitivityParameter, ...]:
-    return ready.derivatives.sensitivity_parameters if ready.derivatives else ()
+    return ready.sensitivities.sensitivity_parameters if ready.sensitivities else ()
 
 
 # --- motions without a derivative ----------------------------------------------------------------
@@ -287,7 +287,7 @@ def _explain_missing_derivative(ready: Prepared) -> str | None:
 def _require_independent_terms(ready: Prepared) -> None:
     """Refuse a caller's controller that has read terms which depend on the parameters (InputError)."""
     parameters = _sensitivity_parameters(ready)
-    name = next((x.name for x in parameters if any(effect.changes_terms for effect in x.effects)), None)
+    name = next((x.name for x in parameters if any(derivative.changes_terms for derivative in x.derivatives)), None)
     if name is not None and ready.loop.term_requested:
         raise InputError(
             f"sensitivities: {name}: the controller reads terms whose parameter dependence is unknown; "
@@ -381,11 +381,11 @@ def _displace_by_placement(
 ) -> Array:
     """Return the derivative of a point's position by its own placement and by that of the joints that carry it."""
     total = np.zeros(3)
-    for effect in parameter.placements:
-        assert effect.placement is not None
-        placed, index = effect.placement.placed, effect.index
+    for derivative in parameter.placements:
+        assert derivative.placement is not None
+        placed, index = derivative.placement.placed, derivative.index
         if (placed == "joint" and index in carriers) or (placed == "reported" and index == number):
-            axis = pose.rotation[effect.placement.carrier] @ effect.placement.axis
-            arm = position - pose.translation[effect.placement.carrier]
-            total += effect.values[0] * (np.cross(axis, arm) if effect.placement.revolute else axis)
+            axis = pose.rotation[derivative.placement.carrier] @ derivative.placement.axis
+            arm = position - pose.translation[derivative.placement.carrier]
+            total += derivative.values[0] * (np.cross(axis, arm) if derivative.placement.revolute else axis)
     return total

@@ -5,7 +5,7 @@ from __future__ import annotations
 from time import process_time
 
 from ckc_pin.run.simulate import record_rows
-from ckc_pin.sensitivity.parameters import derivatives_of
+from ckc_pin.sensitivity.parameters import sensitivity_setup
 from scripts.experiments.bench import prepare_scene
 
 # A scene, its tolerance, and parameter names; the first p of them get sensitivities.
@@ -28,7 +28,8 @@ def ratios(scene: str, rtol: float, names: tuple[str, ...], terms: str) -> list[
     """
     overrides = {"formulation": "dae", "solver.rtol": rtol, "solver.terms": terms}
     runs = [
-        prepare_scene(scene, overrides, derivatives=derivatives_of(names[:p]) if p else None) for p in (0, *NUMBERS)
+        prepare_scene(scene, overrides, set_up_sensitivities=sensitivity_setup(names[:p]) if p else None)
+        for p in (0, *NUMBERS)
     ]
     seconds: list[list[float]] = [[] for _ in runs]
     for _ in range(TIMES):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin import load_scene
 from ckc_pin.run.prepare import prepare
-from ckc_pin.sensitivity.parameters import derivatives_of
+from ckc_pin.sensitivity.parameters import sensitivity_setup
 
 EVENT = {"coordinate": "theta_1", "value": 50.0}
 SCENES: list[tuple[str, dict[str, Any]]] = [
@@ -47,7 +47,9 @@ def main(library: Path) -> int:
     counter.restype = c_long
     bad = 0
     for scene, overrides, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
-        ready = prepare(load_scene(scene, overrides), derivatives=derivatives_of(parameters) if parameters else None)
+        ready = prepare(
+            load_scene(scene, overrides), set_up_sensitivities=sensitivity_setup(parameters) if parameters else None
+        )
         loop = ready.loop
         instants = np.linspace(0.0, 0.3, 31)
         rows = np.empty((40, loop.width))

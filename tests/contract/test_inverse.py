@@ -56,22 +56,21 @@ def test_json() -> None:
     assert [key for key in keys if not re.search(rf"\b{key}\b", row + section)] == []
 
 
-def test_table_names_largest_forces_and_exceeded_limits() -> None:
+def test_summary_names_largest_forces_and_exceeded_limits() -> None:
     answer = ckc("inverse", "five_bar/tracking", "--set", "controller.torque_limit={theta_1 = 1.2, theta_3 = 2.0}")
     assert (answer.code, answer.err) == (0, "")
     forces = inverse_dynamics("five_bar/tracking", {"controller.torque_limit": {"theta_1": 1.2, "theta_3": 2.0}})
-    rows = {line[:14].strip(): line for line in answer.out.splitlines()}
+    rows = {line[:15].strip(): line for line in answer.out.splitlines()}
     for motor, tau in zip(forces.actuated, np.abs(forces.tau).T, strict=True):
         assert f"{tau.max():.4g} N m" in rows[f"motor {motor}"]
         assert f"{forces.t[np.argmax(tau)]:.4g}" in rows[f"motor {motor}"]
     (entry,) = forces.exceeded
     assert entry["motor"] == "theta_1"
-    assert f"1.2 N m, exceeded from t = {entry['t']:.4g} s on" in rows["motor theta_1"]
+    assert f"1.2 N m, exceeded from t = {entry['t']:.4g} s on" in answer.out
     assert rows["motor theta_3"].rstrip().endswith("2 N m")
     elbow = np.linalg.norm(forces.loop_forces["elbow"], axis=1)
     assert f"{elbow.max():.4g} N" in rows["loop elbow"]
     assert "moment" not in answer.out
-    assert answer.out.splitlines()[0].split() == ["of", "the", "motion", "largest", "at", "t", "(s)", "limit"]
 
 
 def test_files(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 from ckc_pin.native import StopReason
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.scene.scene import load_scene
+from ckc_pin.scene.spec import Method
 from tests.analytic.five_bar import FIVE_BAR, Array, Q
 from tests.convergence.steps import steps_of
 
@@ -88,6 +89,10 @@ def errors(exact: Exact, formulation: str, method: str, rtol: float, steps: int)
         assert ready.loop.advance(T_END, final=True, pause=math.inf, budget=math.inf).reason == StopReason.END
         largest.append(max(np.abs(row[[1, 3, 5, 7]] - exact(row[0])).max() for row in rows[: len(times)]))
     return largest[0], largest[1]
+
+
+def test_the_order_of_every_method_is_measured() -> None:
+    assert {name for name, *_ in METHODS.values()} | {"auto"} == set(get_args(Method))
 
 
 @pytest.mark.parametrize("formulation", OFF_MANIFOLD)

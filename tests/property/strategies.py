@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 from hypothesis import strategies as st
 
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec, LoopType
 from tests.property.worlds import JOINTS
 
-TYPES: tuple[LoopType, ...] = (
-    "point",
-    "point_2d",
-    "hinge",
-    "cylindrical",
-    "universal",
-    "prismatic",
-    "weld",
-    "distance",
-)
+TYPES: tuple[LoopType, ...] = get_args(LoopType)
 
 seeds = st.integers(0, 2**32 - 1)
 numbers = st.floats(-1, 1, allow_subnormal=False)

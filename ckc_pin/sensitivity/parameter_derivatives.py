@@ -1,4 +1,4 @@
-"""Effects of parameters on the equations of motion, from the derivative of the parameter map.
+"""Derivatives of the equations of motion with respect to parameters, from the derivative of the parameter map.
 
 A length or an angle becomes the coordinate of a locked joint where something is placed, so that its derivatives are
 those along any other coordinate.
@@ -20,7 +20,7 @@ from ckc_pin.mechanism.parameters import split_name
 from ckc_pin.mechanism.rows import RelativeLog
 from ckc_pin.native.sensitivity_tables import ParameterDerivative, PlacedKind, PlacementJoint
 
-__all__ = ["effects_of"]
+__all__ = ["find_parameter_derivatives"]
 
 BY_INDEX = (
     "length", "constant", "joint_stiffness", "joint_rest", "joint_damping", "stiffness", "rest_length", "damping",
@@ -28,10 +28,10 @@ BY_INDEX = (
 )  # fmt: skip
 
 
-def effects_of(
+def find_parameter_derivatives(
     mechanism: Mechanism, actuation: Actuation, name: str, slopes: Mapping[str, Array]
 ) -> tuple[ParameterDerivative, ...]:
-    """Return the effects of a parameter of the mechanism; none where the motion does not depend on it.
+    """Return the partial derivatives through which a parameter acts; none if the motion does not depend on it.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def effects_of(
 
 
 def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
-    """Effects on where joints, loop frames, spring ends and reported points are placed."""
+    """Derivatives of the placements of joints, loop frames, spring ends and reported points."""
     model, closure, springs = mechanism.tree.model, mechanism.closure, mechanism.springs
     zeros = np.zeros((model.njoints, 3, 3))
     turned, moved = slopes.get("rotation", zeros), slopes.get("offset", zeros[:, 0])
@@ -110,7 +110,7 @@ def _directions(mechanism: Mechanism, loop: str, end: int) -> Iterator[tuple[Pla
 
 
 def _bodies(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
-    """Effects on bodies: mass, moment and inertia about the joint's origin."""
+    """Derivatives of bodies' mass, first moment and inertia about the joint's origin."""
     keys = [key for key in ("mass", "moment", "origin_inertia") if key in slopes]
     for joint in sorted({int(k) for key in keys for k in np.argwhere(slopes[key])[:, 0]}):
         mass = slopes["mass"][joint] if "mass" in slopes else 0.0
@@ -120,7 +120,7 @@ def _bodies(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
 
 
 def _entries(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
-    """Effects on numbers that stand in the equations as in the file."""
+    """Derivatives of numbers that appear in the equations as in the file."""
     if "gravity" in slopes:
         yield ParameterDerivative("gravity", values=slopes["gravity"])
     for key in BY_INDEX:
