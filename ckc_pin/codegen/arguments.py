@@ -11,19 +11,19 @@ from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import list_line_springs, list_loop_frames, list_spring_ends
 
-__all__ = ["Arguments", "argument_names", "constant", "near", "present", "values"]
+__all__ = ["Arguments", "argument_names", "constant", "present", "snap_to_units", "values"]
 
 NEGLIGIBLE = 1e-14  # numbers closer than this to 0, 1 or -1 are replaced by it
 
 
-def present(given: Mapping[str, Array]) -> dict[str, BoolArray]:
+def present(numbers: Mapping[str, Array]) -> dict[str, BoolArray]:
     """Return which numbers are arguments. Zeros are not, so that the code of a planar mechanism is planar."""
-    return {name: np.abs(x) > NEGLIGIBLE for name, x in given.items()}
+    return {name: np.abs(x) > NEGLIGIBLE for name, x in numbers.items()}
 
 
-def values(given: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
+def values(numbers: Mapping[str, Array], which: Mapping[str, BoolArray]) -> Array:
     """Return the arguments, in the order of `Arguments.vector`."""
-    return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in given.items()])
+    return np.concatenate([np.asarray(x, dtype=float)[which[name]] for name, x in numbers.items()])
 
 
 def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
@@ -62,20 +62,21 @@ def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list
 
 
 class Arguments:
-    """Symbols for those numbers.
+    """Symbols of the arguments.
 
     Parameters
     ----------
     which : mapping of str to bool arrays
-        As `present` gives it.
+        As `present` returns it.
 
     Attributes
     ----------
     vector : casadi.SX
     places : list of (str, tuple of int)
-        What each of them is, and where in the array of that name.
+        Of each argument: the name of its array, and its index there.
     groups : list of lists of int
-        Places in it of what changes together: a body's mass, centre and inertia; of other numbers all of a kind.
+        Indices of arguments that are differentiated together: mass, centre and inertia of a body; of other numbers,
+        all of one name.
     """
 
     def __init__(self, which: Mapping[str, BoolArray]) -> None:
@@ -85,43 +86,43 @@ class Arguments:
         for name, there in which.items():
             at = [tuple(int(i) for i in index) for index in np.argwhere(there)]
             self._symbols[name] = {index: cs.SX.sym("_".join([name, *map(str, index)])) for index in at}
-        self.vector = cs.vertcat(*(symbol for found in self._symbols.values() for symbol in found.values()))
+        self.vector = cs.vertcat(*(symbol for symbols in self._symbols.values() for symbol in symbols.values()))
         groups: dict[object, list[int]] = {}
-        self.places = [(name, index) for name, found in self._symbols.items() for index in found]
+        self.places = [(name, index) for name, symbols in self._symbols.items() for index in symbols]
         for place, (name, (first, *_)) in enumerate(self.places):
             groups.setdefault(first if name in ("mass", "centre", "inertia") else name, []).append(place)
         self.groups = [*groups.values()]
 
     def number(self, name: str, *index: int) -> Any:
-        """Return one of them, a structural zero where there is none."""
+        """Return the symbol of a number; a structural zero if it is no argument."""
         import casadi as cs
 
         return self._symbols[name].get(tuple(int(k) for k in index), cs.SX(1, 1))
 
     def column(self, name: str, *index: int) -> Any:
-        """Return three of them as a column."""
+        """Return three numbers as a column."""
         import casadi as cs
 
         return cs.vertcat(*(self.number(name, *index, k) for k in range(3)))
 
     def symmetric(self, name: str, *index: int) -> Any:
-        """Return nine of them as a matrix, of which the lower triangle is read."""
+        """Return nine numbers as a symmetric matrix, from the lower triangle."""
         import casadi as cs
 
         rows = [[self.number(name, *index, max(i, j), min(i, j)) for j in range(3)] for i in range(3)]
         return cs.vertcat(*(cs.horzcat(*row) for row in rows))
 
 
-def near(given: Array) -> Array:
-    """Return plain numbers, of which those that are almost zero or one are."""
-    found = np.array(given, dtype=float)
-    for whole in (0.0, 1.0, -1.0):
-        found[np.abs(found - whole) <= NEGLIGIBLE] = whole
-    return found
+def snap_to_units(numbers: Array) -> Array:
+    """Return a copy of an array; numbers within `NEGLIGIBLE` of 0, 1 or -1 are replaced by it."""
+    snapped = np.array(numbers, dtype=float)
+    for unit in (0.0, 1.0, -1.0):
+        snapped[np.abs(snapped - unit) <= NEGLIGIBLE] = unit
+    return snapped
 
 
-def constant(given: Array) -> Any:
-    """Return a matrix of plain numbers, without what is zero and with ones that are ones."""
+def constant(numbers: Array) -> Any:
+    """Return a constant CasADi matrix with structural zeros, after `snap_to_units`."""
     import casadi as cs
 
-    return cs.sparsify(cs.SX(near(given)))
+    return cs.sparsify(cs.SX(snap_to_units(numbers)))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.codegen.arguments import Arguments, constant, near
+from ckc_pin.codegen.arguments import Arguments, constant, snap_to_units
 from ckc_pin.codegen.graph import Lane
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors
@@ -82,7 +82,7 @@ class AxisRotations:
             group = next((group for group in self.root_groups if branch in group), [branch])
             if base in group or len(group) == 1:
                 continue
-            relative = {k: near(self.placements[k].T @ self.placements[base]) for k in group}
+            relative = {k: snap_to_units(self.placements[k].T @ self.placements[base]) for k in group}
             differs = np.ptp([*relative.values()], axis=0) > 0
             R = constant(np.where(differs, 0.0, relative[branch]))
             for i, j in np.argwhere(differs).tolist():
