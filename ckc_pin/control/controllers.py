@@ -170,7 +170,7 @@ class SetPoint:
         Symmetric positive definite, in the order of `independent`; K_V may be semi-definite.
     q_d : (d,) array or {coordinate: number}
         The target.
-    near : Kinematics, optional
+    start : Kinematics, optional
         A configuration of the assembly branch on which h(q_d) is evaluated; default: the assembled configuration.
 
     Raises
@@ -185,7 +185,7 @@ class SetPoint:
         K_P: Gain | Array,
         K_V: Gain | Array,
         q_d: Array | Mapping[str, float],
-        near: Kinematics | None = None,
+        start: Kinematics | None = None,
     ) -> None:
         require_type(mechanism, Mechanism, "SetPoint: mechanism", "a Mechanism, as load returns it")
         names = mechanism.independent
@@ -198,7 +198,7 @@ class SetPoint:
                 raise InputError(f"SetPoint: q_d has {len(q_d)} numbers; {len(names)} are needed: {', '.join(names)}")
             q_d = dict(zip(names, q_d, strict=True))
         self.q_d = q_d = mechanism.vector(q_d, names, "controller.q_d")
-        target = sigma(mechanism, q_d, near)
+        target = sigma(mechanism, q_d, start)
         if target.verdict != "converged":
             values = ", ".join(f"{k} = {x:g}" for k, x in zip(mechanism.independent, q_d, strict=True))
             raise InputError(f"controller.q_d: the target {values} is {target.verdict}: {target.reason}")
