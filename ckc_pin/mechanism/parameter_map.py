@@ -204,16 +204,16 @@ class _Members:
         self.map, self.mechanism, self.count = parameters, parameters.mechanism, len(values)
         self.numbers: dict[str, Numbers] = {}
         self.is_physical: BoolArray = np.all(np.isfinite(values), axis=1)
-        self.varied: dict[str, Numbers] = {}  # by vector or number
+        self.member_values: dict[str, Numbers] = {}  # by vector or scalar parameter
         for name, column in zip(names, values.T, strict=True):
             vector, axis = split_component(name)
             if name in parameters.values:
-                self.varied[name] = column
+                self.member_values[name] = column
                 continue
-            if vector not in self.varied:
+            if vector not in self.member_values:
                 start = np.array(parameters.values[vector], dtype=values.dtype)
-                self.varied[vector] = np.tile(start, (self.count, 1))
-            self.varied[vector][:, axis] = column
+                self.member_values[vector] = np.tile(start, (self.count, 1))
+            self.member_values[vector][:, axis] = column
 
     # --- numbers that stand in the model as in the file ---
 
@@ -221,7 +221,7 @@ class _Members:
         """Add numbers of gravity, joints, loops, couplings, springs, forces and motors."""
         add = {"joint": self._add_joint, "loop": self._add_loop, "coupling": self._add_coupling,
                "spring": self._add_spring, "force": self._add_force, "motor": self._add_motor}  # fmt: skip
-        for name, column in self.varied.items():
+        for name, column in self.member_values.items():
             root, carrier, key = split_name(name)
             if root == "gravity":
                 self.numbers["gravity"] = column
@@ -266,13 +266,13 @@ class _Members:
     def _add_motor(self, name: str, carrier: str, key: str, column: Numbers) -> None:
         number = self.mechanism.motors.names.index(carrier)
         motor, gear = self.mechanism.spec.motor[number], self.mechanism.motors.transmission[number]
-        ratio = self.varied.get(f"motor.{carrier}.ratio", motor.ratio)
-        inertia = self.varied.get(f"motor.{carrier}.rotor_inertia", motor.rotor_inertia or 0.0)
+        ratio = self.member_values.get(f"motor.{carrier}.ratio", motor.ratio)
+        inertia = self.member_values.get(f"motor.{carrier}.rotor_inertia", motor.rotor_inertia or 0.0)
         if key == "torque_limit":
             self._set("torque_limit", number, column)
         elif key == "ratio":
             self._set("transmission", number, gear * (column / motor.ratio)[:, None])
-        if key == "rotor_inertia" or (key == "ratio" and f"motor.{carrier}.rotor_inertia" not in self.varied):
+        if key == "rotor_inertia" or (key == "ratio" and f"motor.{carrier}.rotor_inertia" not in self.member_values):
             for at in map(int, np.flatnonzero(gear)):
                 step = (gear[at] * ratio / motor.ratio) ** 2 * inertia - gear[at] ** 2 * (motor.rotor_inertia or 0.0)
                 self._increase("armature", at, step)
@@ -287,7 +287,7 @@ class _Members:
     def _array(self, key: str) -> Numbers:
         if key not in self.numbers:
             start = self.map.all_numbers[key]
-            dtype = np.result_type(float, *self.varied.values())
+            dtype = np.result_type(float, *self.member_values.values())
             self.numbers[key] = np.tile(start.astype(dtype), (self.count, *([1] * start.ndim)))
         return self.numbers[key]
 
@@ -295,7 +295,9 @@ class _Members:
 
     def add_geometry(self) -> None:
         """Add placements of joints, bodies, loop frames, spring ends and points."""
-        if not any(name.startswith("link.") or (x.ndim > 1 and name != "gravity") for name, x in self.varied.items()):
+        if not any(
+            name.startswith("link.") or (x.ndim > 1 and name != "gravity") for name, x in self.member_values.items()
+        ):
             return
         spec = self.mechanism.spec
         self.links: dict[str, tuple[int, Numbers, Numbers]] = {}  # body, rotation, translation in it
@@ -308,14 +310,14 @@ class _Members:
             for key, frames in (("point", loops), ("end", ends), ("reported", points)):
                 for k, (name, frame) in enumerate(frames):
                     rotation, translation = self._place_frame(name, frame)
-                    self._set_if_varied(key, k, translation, 1)
+                    self._set_if_dependent(key, k, translation, 1)
                     if key == "point":
-                        self._set_if_varied("point_rotation", k, rotation, 2)
+                        self._set_if_dependent("point_rotation", k, rotation, 2)
 
     def _value(self, name: str) -> Numbers:
-        return self.varied.get(name, np.array(self.map.values.get(name, (0.0, 0.0, 0.0)), dtype=float))
+        return self.member_values.get(name, np.array(self.map.values.get(name, (0.0, 0.0, 0.0)), dtype=float))
 
-    def _set_if_varied(self, key: str, at: int, x: Numbers, ndim: int) -> None:
+    def _set_if_dependent(self, key: str, at: int, x: Numbers, ndim: int) -> None:
         if x.ndim > ndim:
             self._set(key, at, x)
 
@@ -336,8 +338,8 @@ class _Members:
             rotation = rotation @ _rpy_matrix(self._value(f"joint.{name}.rpy"))
             if self.mechanism.tree.model.existJointName(name):
                 body = self.mechanism.tree.model.getJointId(name)
-                self._set_if_varied("offset", body, translation, 1)
-                self._set_if_varied("rotation", body, rotation, 2)
+                self._set_if_dependent("offset", body, translation, 1)
+                self._set_if_dependent("rotation", body, rotation, 2)
                 rotation, translation = np.eye(3), np.zeros(3)
             self.joints[name] = self.links[_link(joint, "child")] = (body, rotation, translation)
 
@@ -373,7 +375,7 @@ class _Members:
         if np.all(total != 0):
             members |= {"centre": (centre, 1), "inertia": (inertia, 2)}
         for key, (x, ndim) in members.items():
-            self._set_if_varied(key, body, x, ndim)
+            self._set_if_dependent(key, body, x, ndim)
 
     def _link_inertia(self, name: str, mass: Numbers) -> Numbers:
         """A link's inertia about its centre: a new mass is the same body of another density."""
@@ -385,13 +387,13 @@ class _Members:
             self.is_physical &= mass.real > 0
             step = mass - self.map.value_of(f"link.{name}.mass")
             tensor = tensor + step[:, None, None] * self.map.inertia_per_mass(name)
-        entries = [entry for entry in INERTIA_ENTRIES if f"link.{name}.inertia.{entry}" in self.varied]
+        entries = [entry for entry in INERTIA_ENTRIES if f"link.{name}.inertia.{entry}" in self.member_values]
         if entries:
-            dtype = np.result_type(tensor, *self.varied.values())
+            dtype = np.result_type(tensor, *self.member_values.values())
             tensor = np.array(np.broadcast_to(tensor, (self.count, 3, 3)), dtype=dtype)
             for entry in entries:
                 i, j = INERTIA_ENTRIES[entry]
-                tensor[:, i, j] = tensor[:, j, i] = self.varied[f"link.{name}.inertia.{entry}"]
+                tensor[:, i, j] = tensor[:, j, i] = self.member_values[f"link.{name}.inertia.{entry}"]
             finite = np.where(np.isfinite(tensor), tensor, 0.0).real
             self.is_physical &= np.linalg.eigvalsh(finite)[:, 0] >= 0
         return tensor
@@ -403,7 +405,7 @@ class _Members:
         if frame is None or isinstance(frame, str):
             xyz, rpy = (self._value(f"{name}.{x}") for x in ("xyz", "rpy"))
         else:
-            xyz, rpy = (self.varied.get(f"{name}.{x}", np.array(getattr(frame, x))) for x in ("xyz", "rpy"))
+            xyz, rpy = (self.member_values.get(f"{name}.{x}", np.array(getattr(frame, x))) for x in ("xyz", "rpy"))
         return rotation @ _rpy_matrix(rpy), translation + _turn(rotation, xyz)
 
 

@@ -1,7 +1,7 @@
-"""The numbers of a mechanism by name, `link.rod.mass`, and how they are changed without writing a file.
+"""Parameters of a mechanism by name, `link.rod.mass`, and overrides of their values.
 
-What is changed is what was read: the elements of the URDF and the tables of the mechanism's file. Everything that
-follows from them (checks, loops, assembly) is then done as if the files had said so.
+Overrides are applied to the data of the files: the elements of the URDF and the tables of the mechanism's file. Checks,
+loops and assembly then use the new values as if they had been read.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ OF_JOINT = ("armature", "damping", "friction", "restitution")  # keys of [[joint
 OF_LINK = ("mass", "com", *(f"inertia.{entry}" for entry in INERTIA))
 INERTIA_ENTRIES = {entry: ("xyz".index(entry[1]), "xyz".index(entry[2])) for entry in INERTIA}  # rows and columns
 VECTORS = ("gravity", "com", "xyz", "rpy")  # keys of three numbers each
-UNBOUNDED = 1e300  # what the URDF's limits are where there is none
+UNBOUNDED = 1e300  # absolute value of a limit of the URDF that stands for no limit
 OF_ENTRY = {
     "loop": ("frame_a.xyz", "frame_a.rpy", "frame_b.xyz", "frame_b.rpy", "length"),
     "coupling": ("ratio", "offset"),
@@ -57,13 +57,13 @@ def is_parameter(key: str) -> bool:
     return key.partition(".")[0] in ROOTS
 
 
-def plain_values(given: Mapping[str, Any]) -> dict[str, Value]:
-    """Return values as they are after a file: lists of three as tuples."""
-    return {name: tuple(x) if isinstance(x, list) else x for name, x in given.items()}
+def plain_values(values: Mapping[str, Any]) -> dict[str, Value]:
+    """Return values with lists, as JSON has them, converted to tuples."""
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in values.items()}
 
 
 def values_of(spec: MechanismSpec, urdf: ElementTree.Element) -> dict[str, Value]:
-    """Return every number that has a name, with its value; three of them (a point, a vector) as one.
+    """Return the values of all parameters by name; points and vectors as tuples of three.
 
     Parameters
     ----------
@@ -77,32 +77,32 @@ def values_of(spec: MechanismSpec, urdf: ElementTree.Element) -> dict[str, Value
 def changed(
     spec: MechanismSpec, urdf: ElementTree.Element, overrides: Overrides, source: str
 ) -> tuple[MechanismSpec, list[str]]:
-    """Change numbers of a mechanism: the elements of `urdf` in place, its file's in what is returned.
+    """Apply overrides of parameters: to the elements of `urdf` in place, and to a copy of `spec`.
 
-    A new mass scales the link's inertia with it, the same body of another density, unless numbers of that inertia are
-    given too. A new centre of mass moves the inertia along.
+    A new mass scales the inertia of the link, as another density would, unless entries of that inertia are overridden
+    too. A new centre of mass moves the inertia with it.
 
     Returns
     -------
     MechanismSpec
     list of str
-        Warnings about the bodies that there are now.
+        Warnings about the inertias of changed bodies.
 
     Raises
     ------
     InputError, MechanismError
-        Unknown names (those there are are listed), values that are none, bodies that cannot be.
+        Unknown names (similar names are listed), invalid values, or bodies that are not physical.
     """
     present = values_of(spec, urdf)
     require_known(overrides, with_components(present), f"{source}: parameters")
-    whole = _whole(present, overrides, source)
+    merged = _merge_components(present, overrides, source)
     data = spec.to_dict()
     links = {link.attrib["name"]: link for link in urdf.findall("link")}
     joints = {joint.attrib["name"]: joint for joint in urdf.findall("joint")}
     warnings: list[str] = []
     touched, limited = set(), set()
-    # masses first: they scale an inertia that may be given too
-    for name, value in sorted(whole.items(), key=lambda item: not item[0].endswith(".mass")):
+    # Masses come first: they scale inertias, whose entries may be overridden too.
+    for name, value in sorted(merged.items(), key=lambda item: not item[0].endswith(".mass")):
         root, carrier, key = split_name(name)
         if root == "gravity":
             data["gravity"] = value
@@ -126,44 +126,44 @@ def changed(
 
 
 def with_components(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Add the components of what has three: `gravity.x`."""
-    found: dict[str, Value] = {}
+    """Return values with the components of points and vectors added: `gravity.x`."""
+    all_values: dict[str, Value] = {}
     for name, value in values.items():
-        found[name] = value
+        all_values[name] = value
         if isinstance(value, tuple):
-            found.update({f"{name}.{axis}": x for axis, x in zip(AXES, value, strict=True)})
-    return found
+            all_values.update({f"{name}.{axis}": x for axis, x in zip(AXES, value, strict=True)})
+    return all_values
 
 
-def parts_of(name: str, known: Mapping[str, Value]) -> list[str]:
-    """Return the single numbers that a known name stands for: itself, or a vector's three."""
-    return [f"{name}.{axis}" for axis in AXES] if isinstance(known[name], tuple) else [name]
+def parts_of(name: str, values: Mapping[str, Value]) -> list[str]:
+    """Return the names of the components of a vector; of a scalar, its name."""
+    return [f"{name}.{axis}" for axis in AXES] if isinstance(values[name], tuple) else [name]
 
 
-def require_known(names: Iterable[str], known: Mapping[str, Value], where: str, roots: Sequence[str] = ROOTS) -> None:
-    """Refuse names that are none of those known (InputError): those there are nearby are listed.
+def require_known(names: Iterable[str], values: Mapping[str, Value], where: str, roots: Sequence[str] = ROOTS) -> None:
+    """Raise InputError if a name is no parameter; the message lists similar names.
 
     Parameters
     ----------
     names : iterable of str
-    known : mapping
-        As `with_components` gives it.
+    values : mapping
+        The parameters, as `with_components` returns them.
     where : str
-        What begins the message.
+        Prefix of the message.
     roots : sequence of str
-        What names may begin with.
+        First words that names may have.
     """
     for name in names:
-        if name in known:
+        if name in values:
             continue
         root = name.partition(".")[0]
         if root not in roots:
             raise InputError(f"{where}: {name!r} names nothing; names begin with {', '.join(roots)}")
-        carriers = dict.fromkeys(_carrier(other) for other in known if other.partition(".")[0] == root)
-        near = [c for c in carriers if name == c or name.startswith(f"{c}.")]
-        if near:
-            best = max(near, key=len)
-            choices = [other for other in known if _carrier(other) == best]
+        carriers = dict.fromkeys(_carrier(other) for other in values if other.partition(".")[0] == root)
+        matches = [c for c in carriers if name == c or name.startswith(f"{c}.")]
+        if matches:
+            best = max(matches, key=len)
+            choices = [other for other in values if _carrier(other) == best]
         else:
             choices = list(carriers)
         whose = "mechanism" if root in ROOTS else "scene"
@@ -171,16 +171,16 @@ def require_known(names: Iterable[str], known: Mapping[str, Value], where: str, 
         raise InputError(f"{where}: no {name!r}; {there}")
 
 
-def _whole(present: Mapping[str, Value], overrides: Overrides, source: str) -> dict[str, Value]:
-    """Put components into what they are of, and check how many numbers each name takes."""
-    whole: dict[str, Value] = {}
+def _merge_components(present: Mapping[str, Value], overrides: Overrides, source: str) -> dict[str, Value]:
+    """Replace overrides of components by overrides of their vectors. Check the number of values of each name."""
+    merged: dict[str, Value] = {}
     for name, value in overrides.items():
         _require_numbers(name, value, source)
         if name in present:
             three = isinstance(present[name], tuple)
             if three != isinstance(value, tuple):
                 raise InputError(f"{source}: parameters: {name} takes {'three numbers' if three else 'one number'}")
-            whole[name] = value
+            merged[name] = value
     for name, value in overrides.items():
         if name in present:
             continue
@@ -189,10 +189,10 @@ def _whole(present: Mapping[str, Value], overrides: Overrides, source: str) -> d
             raise InputError(f"{source}: parameters: {of} and {name} are both given; give one of them")
         if isinstance(value, tuple):
             raise InputError(f"{source}: parameters: {name} takes one number")
-        vector = list(whole.get(of, present[of]))  # type: ignore[arg-type]
+        vector = list(merged.get(of, present[of]))  # type: ignore[arg-type]
         vector[AXES.index(axis)] = value
-        whole[of] = (vector[0], vector[1], vector[2])
-    return whole
+        merged[of] = (vector[0], vector[1], vector[2])
+    return merged
 
 
 def _require_numbers(name: str, value: Any, source: str) -> None:
@@ -215,20 +215,20 @@ def _all(spec: MechanismSpec, urdf: ElementTree.Element) -> Iterator[tuple[str, 
         yield f"link.{name}.com", _three(_read(inertial, "origin", "xyz", 3))
         for entry in INERTIA:
             yield f"link.{name}.inertia.{entry}", _read(inertial, "inertia", entry, 1)[0]
-    own = {entry.name: entry for entry in spec.joint}
+    entries = {entry.name: entry for entry in spec.joint}
     for joint in urdf.findall("joint"):
         name = joint.attrib["name"]
         for key in ("xyz", "rpy"):
             yield f"joint.{name}.{key}", _three(_read(joint, "origin", key, 3))
         if joint.attrib["type"] in ("fixed", "floating"):
             continue
-        entry_ = own.get(name)
+        entry_ = entries.get(name)
         for key in OF_JOINT:
-            given = None if entry_ is None else getattr(entry_, key)
+            value = None if entry_ is None else getattr(entry_, key)
             if key == "restitution" and not (entry_ and entry_.stops):
                 continue
             of_urdf = _read(joint, "dynamics", key, 1)[0] if key in ("damping", "friction") else 0.0
-            yield f"joint.{name}.{key}", of_urdf if given is None else float(given)
+            yield f"joint.{name}.{key}", of_urdf if value is None else float(value)
         if entry_ and entry_.stops:  # other limits do nothing
             for key in LIMITS:
                 at = _read(joint, "limit", key, 1)[0]
@@ -238,7 +238,7 @@ def _all(spec: MechanismSpec, urdf: ElementTree.Element) -> Iterator[tuple[str, 
 
 
 def _of_file(spec: MechanismSpec) -> Iterator[tuple[str, Value]]:
-    """Numbers of the tables [[loop]], [[coupling]], [[spring]], [[force]] and [[motor]]."""
+    """Parameters of the tables [[loop]], [[coupling]], [[spring]], [[force]] and [[motor]]."""
     data = spec.to_dict()
     for kind, keys in OF_ENTRY.items():
         for k, entry in enumerate(data[kind]):
@@ -254,7 +254,7 @@ def _of_file(spec: MechanismSpec) -> Iterator[tuple[str, Value]]:
 
 
 def _has(kind: str, entry: Mapping[str, Any], key: str) -> bool:
-    """Whether an entry has such a number at all."""
+    """Whether an entry has this parameter."""
     if kind == "spring":
         on_joint = entry["joint"] is not None
         return key in ("stiffness", "damping") or key == ("rest" if on_joint else "rest_length")
@@ -262,12 +262,12 @@ def _has(kind: str, entry: Mapping[str, Any], key: str) -> bool:
 
 
 def _called(kind: str, k: int, entry: Mapping[str, Any]) -> str:
-    """Loops and motors have names, the others a number, the first one's is 0."""
+    """Name of an entry: loops and motors have names, the other tables are numbered from 0."""
     return str({"loop": entry.get("name"), "motor": entry.get("name") or entry.get("joint")}.get(kind) or k)
 
 
 def _carrier(name: str) -> str:
-    """What a number is of: its name without the key at its end."""
+    """Return a parameter's name without the key at its end: ``link.rod`` of ``link.rod.mass``."""
     root, _, rest = name.partition(".")
     keys = _keys(root)
     if not keys:
@@ -282,7 +282,7 @@ def _keys(root: str) -> tuple[str, ...]:
 
 
 def split_component(name: str) -> tuple[str, int]:
-    """Take a single number's name apart: the vector's that it is of, and which of its three; or itself, and 0."""
+    """Split the name of a component into its vector and the index of the component; of a scalar: its name and 0."""
     of, _, axis = name.rpartition(".")
     if axis in AXES and of and of.rpartition(".")[2] in VECTORS:
         return of, AXES.index(axis)
@@ -290,7 +290,7 @@ def split_component(name: str) -> tuple[str, int]:
 
 
 def split_name(name: str) -> tuple[str, str, str]:
-    """Take a known name apart, without its component: root, what it is of, and key, ("link", "rod", "mass")."""
+    """Split the name of a parameter into root, carrier and key: ("link", "rod", "mass")."""
     root, _, rest = name.partition(".")
     key = max((key for key in _keys(root) if rest.endswith(f".{key}")), key=len, default="")
     return root, rest.removesuffix(f".{key}"), key
@@ -313,8 +313,8 @@ def _text(value: Value) -> str:
 
 
 def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
-    found = element.find(tag)
-    return ElementTree.SubElement(element, tag) if found is None else found
+    child = element.find(tag)
+    return ElementTree.SubElement(element, tag) if child is None else child
 
 
 def _change_link(link: ElementTree.Element, key: str, value: Value) -> None:

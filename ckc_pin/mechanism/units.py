@@ -1,4 +1,4 @@
-"""Units of a mechanism's quantities and of its numbers that have a name, "" where they have none."""
+"""Units of a mechanism's quantities and parameters; "" for dimensionless ones."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from ckc_pin.mechanism.parameters import split_component, split_name
 
 __all__ = ["effort", "joined", "motor_units", "parameter_unit", "row_units"]
 
-ROTOR = {"m": "kg", "rad": "kg m²"}  # what resists an acceleration, by the unit of what is accelerated
+ROTOR = {"m": "kg", "rad": "kg m²"}  # inertia of a coordinate, by its unit
 STIFF = {"m": "N/m", "rad": "N m/rad"}
 VISCOUS = {"m": "N s/m", "rad": "N m s/rad"}
-OF_LINK = {"mass": "kg", "com": "m"}  # the rest are entries of an inertia
+OF_LINK = {"mass": "kg", "com": "m"}  # other keys are entries of an inertia
 OF_FRAME = {"xyz": "m", "rpy": "rad"}
 
 
 def joined(units: Iterable[str]) -> str:
-    """Return one unit for several quantities: theirs, or all there are, "rad or m"."""
+    """Return the units of several quantities as one text, "rad or m"."""
     return " or ".join(sorted({unit for unit in units if unit}, key=len, reverse=True))
 
 
 def effort(unit: str) -> str:
-    """Return the unit of what acts along a coordinate of unit "m" or "rad"."""
+    """Return the unit of the generalized force on a coordinate of unit "m" or "rad"."""
     return "N" if unit == "m" else "N m"
 
 
 def motor_units(mechanism: Mechanism) -> list[str]:
-    """Return the unit of what each motor gives: "N" where it pushes slides alone, "N m" otherwise."""
+    """Return the unit of each motor's output: "N" if it drives only prismatic joints, "N m" otherwise."""
     return [effort(unit) for unit in _shafts(mechanism)]
 
 
@@ -39,7 +39,7 @@ def row_units(mechanism: Mechanism) -> list[str]:
 
 
 def parameter_unit(mechanism: Mechanism, name: str) -> str:
-    """Return the unit of a number of the mechanism by its name, as `mechanism.parameters` has them."""
+    """Return the unit of a parameter of `mechanism.parameters`."""
     root, carrier, key = split_name(split_component(name)[0])
     last = key.rpartition(".")[2]
     if root == "gravity":
@@ -58,7 +58,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
 
 
 def _of_coordinate(mechanism: Mechanism, root: str, carrier: str, key: str) -> str:
-    """Return the unit of a number whose unit is that of a coordinate, or follows from it."""
+    """Return the unit of a parameter that depends on the unit of a coordinate."""
     spec, units = mechanism.spec, dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
     if root == "coupling":
         coupling = spec.coupling[int(carrier)]
@@ -69,11 +69,11 @@ def _of_coordinate(mechanism: Mechanism, root: str, carrier: str, key: str) -> s
         unit = "m" if joint is None else units[joint]
         return {"stiffness": STIFF[unit], "damping": VISCOUS[unit], "rest_length": "m"}.get(key, unit)
     unit = units[spec.force[int(carrier)].joint if root == "force" else carrier]
-    own = {"armature": ROTOR[unit], "damping": VISCOUS[unit], "restitution": "", "lower": unit, "upper": unit}
-    return own.get(key, effort(unit))  # friction, and a force's value
+    by_key = {"armature": ROTOR[unit], "damping": VISCOUS[unit], "restitution": "", "lower": unit, "upper": unit}
+    return by_key.get(key, effort(unit))  # friction, and the value of a force
 
 
 def _shafts(mechanism: Mechanism) -> list[str]:
-    """Return the unit of each motor's own angle, or way."""
+    """Return the unit of each motor's coordinate: "m" if it drives only prismatic joints, "rad" otherwise."""
     lengths, turns = mechanism.tree.in_metres, mechanism.motors.transmission != 0
     return ["m" if np.all(lengths[row]) else "rad" for row in turns]
