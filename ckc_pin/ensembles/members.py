@@ -263,27 +263,31 @@ class Members:
         if numbers and self._library is not None:
             parameters.append((_core.CoreParameter.COMPILED, self._numbers.arguments(numbers, len(values))[batched]))
         q, q_dot = self._compute_starts(values[batched])
-        recorded_by_key = {"last": recorded.last_row, "kept": recorded.series, "met": recorded.event_times}
-        out: dict[str, Any] = {name: np.zeros(count, np.int64) for name in ("why", "filled")}
-        out |= {"work": np.zeros(3 * count, np.int64), "t": np.empty(count)}
+        recorded_by_key = {
+            "last_row": recorded.last_row,
+            "series": recorded.series,
+            "event_times": recorded.event_times,
+        }
+        out: dict[str, Any] = {name: np.zeros(count, np.int64) for name in ("stop_reason", "row_count")}
+        out |= {"counters": np.zeros(3 * count, np.int64), "t": np.empty(count)}
         out |= {key: np.full((count, *array.shape[1:]), np.nan) for key, array in recorded_by_key.items()}
         self._batch.run(
             self._base, q, q_dot, parameters=[(kind, np.ascontiguousarray(x)) for kind, x in parameters],
             instants=self.instants, columns=self.outputs.columns, until=self.scene.spec.t_end, out=out,
         )  # fmt: skip
-        reasons = out["why"]  # values of StopReason; -1: the member could not be started
-        is_regular = np.isin(reasons, (END, EVENT)) & (out["filled"] > 0)
+        reasons = out["stop_reason"]  # values of StopReason; -1: the member could not be started
+        is_regular = np.isin(reasons, (END, EVENT)) & (out["row_count"] > 0)
         for key, array in recorded_by_key.items():
             array[batched[is_regular]] = out[key][is_regular]
         status[batched[is_regular]] = DONE
         for k in np.flatnonzero(reasons == EVENT):
             stopping = [j for j, event in enumerate(self.ready.events) if event.stop]
-            times = out["met"][k]
+            times = out["event_times"][k]
             j = max(stopping, key=lambda j: (times[j] == times[j], times[j]))  # NaN first
             message[batched[k]] = (
                 f"stopped by the event at t = {out['t'][k]:.9g} s: {self.ready.events[j].label['name']}"
             )
-        return int(out["work"].reshape(-1, 3)[is_regular, 0].sum())
+        return int(out["counters"].reshape(-1, 3)[is_regular, 0].sum())
 
     def _compute_starts(self, values: Array) -> tuple[Array, Array]:
         """Return q and q_dot at the start of some members, (members, d) each."""

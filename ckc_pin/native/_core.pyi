@@ -75,7 +75,7 @@ class StopReason(enum.Enum):
     """the budget of time is used up"""
 
     PACE = 5
-    """the rest would take too many right-hand sides"""
+    """the remaining motion would take too many right-hand sides"""
 
     MIN_STEP = 6
     """the step size fell below its minimum"""
@@ -84,7 +84,7 @@ class StopReason(enum.Enum):
     """no step can be made, see StepFailure"""
 
     RANK = 8
-    """J loses rank, and that cannot be crossed"""
+    """J loses rank, and the position cannot be crossed"""
 
     COORDINATES_SINGULAR = 9
     """phi_z is singular: q does not determine z"""
@@ -139,7 +139,7 @@ class RhsFailure(enum.Enum):
     """a motor jumps from one limit to the other"""
 
 class JointTransitionKind(enum.Enum):
-    """How the mode of a joint changes."""
+    """A transition between joint modes."""
 
     STICKS = 0
 
@@ -175,7 +175,7 @@ class NonDifferentiableReason(enum.Enum):
     """a holding force is at its bound"""
 
 class CoreParameter(enum.Enum):
-    """Kinds of parameters that a core can be given."""
+    """Kinds of parameters of a core."""
 
     GRAVITY = 0
 
@@ -217,7 +217,7 @@ class CoreParameter(enum.Enum):
     """the parameters of the compiled terms"""
 
 class ParameterDerivativeKind(enum.Enum):
-    """How a parameter acts."""
+    """The quantity that depends on a parameter."""
 
     PLACEMENT = 0
 
@@ -299,7 +299,7 @@ class StepFailure:
 
     @property
     def margin(self) -> float:
-        """that over the norm of J"""
+        """sigma_min over the norm of J"""
 
     @property
     def q_tree(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]: ...
@@ -331,7 +331,7 @@ class Event:
     def stop(self) -> bool: ...
 
 class EventOccurrence:
-    """An event has occurred."""
+    """The occurrence of an event."""
 
     @property
     def t(self) -> float: ...
@@ -344,7 +344,7 @@ class EventOccurrence:
         """1: rising, -1: falling"""
 
 class JointTransition:
-    """The mode of a joint has changed."""
+    """A transition of a joint's mode."""
 
     @property
     def t(self) -> float: ...
@@ -475,7 +475,7 @@ class Loop:
         self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, torques: bool
     ) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None] | None:
         """
-        Hold u, or motor torques, and advance. Return the stop and `state`, None at a pause; None if a number is not finite.
+        Hold u, or motor torques, and advance. Return the stop and `state` (None at a pause); None if a number is not finite.
         """
 
     def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None:
@@ -522,7 +522,9 @@ class Loop:
         """Return evaluations and seconds by term."""
 
     def rhs(self, t: float, y: numpy.typing.NDArray[numpy.float64]) -> numpy.typing.NDArray[numpy.float64] | None:
-        """Return y' at (t, y), with what acts there; None if it does not exist."""
+        """
+        Return y' at (t, y), including control and friction; None if it does not exist.
+        """
 
     def jacobian(
         self, t: float, y: numpy.typing.NDArray[numpy.float64]
@@ -743,7 +745,9 @@ class Linearization:
         v_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
         u_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
         locked: Sequence[int],
-    ) -> dict[str, Any] | None: ...
+    ) -> dict[str, Any] | None:
+        """Return the linearization at one state; None if J has lost rank."""
+
     def seconds(
         self,
         q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],

@@ -265,7 +265,11 @@ def _formulation_table(mechanism: Mechanism, spec: SceneSpec, inertias: np.ndarr
             f"initial.w: joints of {mechanism.name} that stick or rest at stops cannot be held off phi = 0; remove it"
         )
     evenness = min(1.0, MAX_INERTIA_RATIO * float(inertias.min()) / float(inertias.max()))
-    return {"kind": "level_set", **table, "rhs_slack": CLOSURE_TOLERANCE * spec.solver.rtol * mechanism.size * evenness}
+    return {
+        "kind": "level_set",
+        **table,
+        "rhs_tolerance": CLOSURE_TOLERANCE * spec.solver.rtol * mechanism.size * evenness,
+    }
 
 
 def _solver_table(mechanism: Mechanism, spec: SceneSpec, *, profile: bool) -> dict[str, Any]:

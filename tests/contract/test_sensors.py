@@ -288,7 +288,7 @@ def test_empty_sensor_table_has_no_effect() -> None:
 
 def test_measurement_out_of_reach_stops_the_run() -> None:
     overrides = {"t_end": 0.05, "controller.sample_time": 0.001, "controller.sensor": {"q_noise": 30.0}}
-    with pytest.raises(NumericalError, match="the loops do not close at what the sensors say of q"):
+    with pytest.raises(NumericalError, match="the loops cannot be closed at the measured q"):
         simulate("five_bar/tracking", overrides)
 
 

@@ -24,7 +24,7 @@ using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>;
 
 constexpr std::int64_t not_started = -1;
-constexpr double pause = 0.05;  // s, until a worker notices that it should stop
+constexpr double polling_interval = 0.05;  // s, after which a worker checks whether it should stop
 
 struct ParameterColumns {
   Core::Parameter kind;
@@ -39,15 +39,15 @@ struct Worker {
   Vector v_tree, w;
 };
 
-// What to compute for each member, and Python's arrays for the results, one row per member.
-struct Task {
-  Vector base, instants;
+// The inputs of all members, and Python's arrays for their results, one row per member.
+struct EnsembleTask {
+  Vector base, instants;  // q' from which the closure is solved; output instants
   Numbers q, q_dot;
   std::vector<ParameterColumns> parameter_columns;
-  Indices columns;
+  Indices columns;  // columns of the record that `series` contains
   double until;
-  Counts why, filled, work;
-  Numbers t, last, kept, met;
+  Counts stop_reason, row_count, counters;  // counters: right-hand sides, steps, rejected steps
+  Numbers t, last_row, series, event_times;
   std::int64_t members;
 };
 
@@ -55,7 +55,7 @@ void require_shape(const Numbers& x, std::initializer_list<Eigen::Index> shape, 
   bool fits = x.ndim() == shape.size();
   size_t k = 0;
   for (Eigen::Index size : shape) fits = fits && x.shape(k++) == static_cast<size_t>(size);
-  require(fits, std::string(what) + ": an array of another shape is needed");
+  require(fits, std::string(what) + ": the array has a wrong shape");
 }
 
 class Batch {
@@ -68,42 +68,42 @@ class Batch {
     for (int k = 0; k < threads; ++k) {
       auto worker = std::make_unique<Worker>();
       prepare(worker->loop, core, formulation, control, solver, events);
-      Core& own = *worker->loop.core;
-      require(own.tree.roots.empty(), "batch: joints with one degree of freedom are needed");
-      worker->q = own.q, worker->z = own.z;
-      worker->closure_solver = std::make_unique<ClosureSolver>(own);
-      worker->v_tree.setZero(own.n), worker->w.setZero(own.constraints.closure.rows);
+      Core& worker_core = *worker->loop.core;
+      require(worker_core.tree.roots.empty(), "batch: joints with one degree of freedom are needed");
+      worker->q = worker_core.q, worker->z = worker_core.z;
+      worker->closure_solver = std::make_unique<ClosureSolver>(worker_core);
+      worker->v_tree.setZero(worker_core.n), worker->w.setZero(worker_core.constraints.closure.rows);
       workers_.push_back(std::move(worker));
     }
   }
 
-  void run(Given base, Numbers q, Numbers q_dot, const nb::list& parameter_columns, Given instants,
+  void run(VectorArg base, Numbers q, Numbers q_dot, const nb::list& parameter_columns, VectorArg instants,
            const Indices& columns, double until, const nb::dict& out) {
     const Core& core = *workers_[0]->loop.core;
-    Task task{base,
-              instants,
-              q,
-              q_dot,
-              {},
-              columns,
-              until,
-              get<Counts>(out, "why"),
-              get<Counts>(out, "filled"),
-              get<Counts>(out, "work"),
-              get<Numbers>(out, "t"),
-              get<Numbers>(out, "last"),
-              get<Numbers>(out, "kept"),
-              get<Numbers>(out, "met"),
-              static_cast<std::int64_t>(q.shape(0))};
+    EnsembleTask task{base,
+                      instants,
+                      q,
+                      q_dot,
+                      {},
+                      columns,
+                      until,
+                      get<Counts>(out, "stop_reason"),
+                      get<Counts>(out, "row_count"),
+                      get<Counts>(out, "counters"),
+                      get<Numbers>(out, "t"),
+                      get<Numbers>(out, "last_row"),
+                      get<Numbers>(out, "series"),
+                      get<Numbers>(out, "event_times"),
+                      static_cast<std::int64_t>(q.shape(0))};
     const Eigen::Index M = task.members, width = workers_[0]->loop.step_loop->recorder.width;
     require(base, core.tree.nq, "base");
     require_shape(q, {M, core.d}, "q"), require_shape(q_dot, {M, core.d}, "q_dot");
-    require_shape(task.t, {M}, "t"), require_shape(task.last, {M, width}, "last");
-    require_shape(task.kept, {M, static_cast<Eigen::Index>(columns.size()), instants.size()}, "kept");
-    require_shape(task.met, {M, static_cast<Eigen::Index>(events_)}, "met");
-    for (const Counts* x : {&task.why, &task.filled})
+    require_shape(task.t, {M}, "t"), require_shape(task.last_row, {M, width}, "last_row");
+    require_shape(task.series, {M, static_cast<Eigen::Index>(columns.size()), instants.size()}, "series");
+    require_shape(task.event_times, {M, static_cast<Eigen::Index>(events_)}, "event_times");
+    for (const Counts* x : {&task.stop_reason, &task.row_count})
       require(x->size() == static_cast<size_t>(M), "out: one number per member is needed");
-    require(task.work.size() == static_cast<size_t>(3 * M), "work: three numbers per member are needed");
+    require(task.counters.size() == static_cast<size_t>(3 * M), "counters: three numbers per member are needed");
     require_indices(columns, static_cast<int>(width), "columns");
     for (nb::handle row : parameter_columns) {
       const auto pair = nb::cast<nb::tuple>(row);
@@ -111,20 +111,20 @@ class Batch {
       task.parameter_columns.push_back({kind, nb::cast<Numbers>(pair[1])});
       require_shape(task.parameter_columns.back().numbers, {M, core.parameter_size(kind)}, "parameters");
     }
-    work(task);
+    run_in_threads(task);
   }
 
  private:
-  void work(const Task& task) {
+  void run_in_threads(const EnsembleTask& task) {
     std::atomic<std::int64_t> next{0};
     std::atomic<bool> cancelled{false};
     std::mutex mutex;
     std::condition_variable ended;
     std::exception_ptr raised;
     size_t busy = workers_.size();
-    const auto each = [&](Worker& worker) {
+    const auto run_worker = [&](Worker& worker) {
       try {
-        for (std::int64_t k; !cancelled && (k = next++) < task.members;) member(worker, task, k, cancelled);
+        for (std::int64_t k; !cancelled && (k = next++) < task.members;) simulate_member(worker, task, k, cancelled);
       } catch (...) {
         std::lock_guard<std::mutex> lock(mutex);
         raised = std::current_exception(), cancelled = true;
@@ -137,9 +137,9 @@ class Batch {
     {
       nb::gil_scoped_release released;
       std::vector<std::thread> threads;
-      for (auto& worker : workers_) threads.emplace_back(each, std::ref(*worker));
+      for (auto& worker : workers_) threads.emplace_back(run_worker, std::ref(*worker));
       std::unique_lock<std::mutex> lock(mutex);
-      while (!ended.wait_for(lock, std::chrono::duration<double>(pause), [&] { return busy == 0; })) {
+      while (!ended.wait_for(lock, std::chrono::duration<double>(polling_interval), [&] { return busy == 0; })) {
         lock.unlock();
         {
           nb::gil_scoped_acquire acquired;
@@ -155,11 +155,12 @@ class Batch {
     if (raised) std::rethrow_exception(raised);
   }
 
-  void member(Worker& worker, const Task& task, std::int64_t k, const std::atomic<bool>& cancelled) const {
+  void simulate_member(Worker& worker, const EnsembleTask& task, std::int64_t k,
+                       const std::atomic<bool>& cancelled) const {
     Core& core = *worker.loop.core;
     StepLoop& step_loop = *worker.loop.step_loop;
     const auto row = [k](const Numbers& x, Eigen::Index size) { return Eigen::Map<Vector>(x.data() + k * size, size); };
-    task.why.data()[k] = not_started;
+    task.stop_reason.data()[k] = not_started;
     for (const ParameterColumns& parameter_columns : task.parameter_columns)
       core.set_parameters(parameter_columns.kind,
                           row(parameter_columns.numbers, core.parameter_size(parameter_columns.kind)));
@@ -178,26 +179,26 @@ class Batch {
     step_loop.record(task.instants, worker.rows.data(), T + 1);
     Stop stop;
     do {
-      stop = step_loop.advance(task.until, true, pause, std::numeric_limits<double>::infinity());
+      stop = step_loop.advance(task.until, true, polling_interval, std::numeric_limits<double>::infinity());
     } while (stop.reason == Stop::pause && !cancelled);
     step_loop.control->failure = {};
-    task.why.data()[k] = stop.reason;
-    const Eigen::Index filled = step_loop.recorder.filled;
-    task.filled.data()[k] = filled;
+    task.stop_reason.data()[k] = stop.reason;
+    const Eigen::Index row_count = step_loop.recorder.filled;
+    task.row_count.data()[k] = row_count;
     task.t.data()[k] = step_loop.t();
-    const long done[] = {step_loop.work.rhs, step_loop.steps[0] + step_loop.steps[1] + step_loop.steps[2],
-                         step_loop.work.rejected};
-    std::copy(done, done + 3, task.work.data() + 3 * k);
-    if (!filled) return;
-    row(task.last, step_loop.recorder.width) = worker.rows.col(filled - 1);
+    const long counters[] = {step_loop.work.rhs, step_loop.steps[0] + step_loop.steps[1] + step_loop.steps[2],
+                             step_loop.work.rejected};
+    std::copy(counters, counters + 3, task.counters.data() + 3 * k);
+    if (!row_count) return;
+    row(task.last_row, step_loop.recorder.width) = worker.rows.col(row_count - 1);
     const auto columns = static_cast<Eigen::Index>(task.columns.size());
     for (Eigen::Index j = 0; j < columns; ++j)
-      for (Eigen::Index i = 0; i < std::min(filled, T); ++i)
+      for (Eigen::Index i = 0; i < std::min(row_count, T); ++i)
         if (worker.rows(0, i) == task.instants(i))
-          task.kept.data()[(k * columns + j) * T + i] = worker.rows(task.columns[j], i);
-    for (const EventOccurrence& crossed : step_loop.events.occurrences) {
-      double& first = task.met.data()[k * static_cast<Eigen::Index>(events_) + crossed.event];
-      if (!(first <= crossed.t)) first = crossed.t;
+          task.series.data()[(k * columns + j) * T + i] = worker.rows(task.columns[j], i);
+    for (const EventOccurrence& occurrence : step_loop.events.occurrences) {
+      double& first = task.event_times.data()[k * static_cast<Eigen::Index>(events_) + occurrence.event];
+      if (!(first <= occurrence.t)) first = occurrence.t;
     }
   }
 

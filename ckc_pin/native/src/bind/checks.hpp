@@ -1,4 +1,4 @@
-// Argument checks of the bindings: sizes and finite numbers. The code below them does not check again.
+// Argument checks of the bindings: sizes and finite numbers. The core does not check them again.
 #pragma once
 
 #include <nanobind/eigen/dense.h>
@@ -16,11 +16,11 @@ namespace ckc {
 
 namespace nb = nanobind;
 
-using Given = nb::DRef<const Vector>;
-using Table = nb::DRef<const Matrix>;
+using VectorArg = nb::DRef<const Vector>;
+using MatrixArg = nb::DRef<const Matrix>;
 
-inline void require(bool holds, const std::string& message) {
-  if (!holds) throw std::invalid_argument(message);
+inline void require(bool condition, const std::string& message) {
+  if (!condition) throw std::invalid_argument(message);
 }
 
 inline void require(In x, Eigen::Index size, const char* what) {

@@ -28,15 +28,16 @@ std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int siz
     require(breaks.size() > 1, "spline: at least two breaks are needed"), require(breaks, breaks.size(), "breaks");
     for (const Matrix& c : coefficients)
       require(c.rows() == breaks.size() - 1 && c.cols() == size && c.allFinite(),
-              "spline: a row of coefficients a piece");
+              "spline: a finite row of coefficients for each piece is needed");
     return std::make_unique<SplineTrajectory>(breaks, coefficients);
   }
-  require(kind == "point", "desired: harmonics, spline or point");
+  require(kind == "point", "desired: the kind must be harmonics, spline or point");
   PointTrajectory::Task task{
       model_from_table(table),    get<Indices>(table, "q_index"), closure_from_table(get<nb::dict>(table, "closure")),
       get<Indices>(table, "psi"), get<Indices>(table, "axis"),    get<Vector>(table, "level")};
   const auto n = task.psi.size();
-  require(task.axis.size() == n && task.level.size() == static_cast<Eigen::Index>(n), "point: rows of one length");
+  require(task.axis.size() == n && task.level.size() == static_cast<Eigen::Index>(n),
+          "point: psi, axis and level must have the same length");
   require_indices(task.psi, task.closure.rows, "psi");
   PointTrajectory::Knots knots{get<Vector>(table, "times"), get<Matrix>(table, "knots"), get<double>(table, "end"),
                                get<std::string>(table, "past_end")};
@@ -123,7 +124,8 @@ std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const C
     const auto times = get<Vector>(table, "times");
     const auto tau = get<Matrix>(table, "tau");
     require(times.size() > 0 && times.allFinite(), "torques: a time is needed");
-    require(tau.cols() == times.size() && tau.rows() == motors && tau.allFinite(), "torques: a finite column a time");
+    require(tau.cols() == times.size() && tau.rows() == motors && tau.allFinite(),
+            "torques: a finite column for each time is needed");
     return std::make_unique<TorqueTable>(times, tau, get<bool>(table, "interpolates"));
   }
   const int d = core.d;
@@ -133,7 +135,7 @@ std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const C
     require_square(K_P, d, "K_P"), require_square(K_V, d, "K_V"), require(q_d, d, "q_d"), require(h_d, d, "h_d");
     return std::make_unique<SetPointController>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
   }
-  require(kind == "tracking", "controller: set_point, tracking, torques or call");
+  require(kind == "tracking", "controller: the kind must be set_point, tracking, torques or call");
   const auto Lambda = get<Matrix>(table, "Lambda"), K_D = get<Matrix>(table, "K_D");
   require_square(Lambda, d, "Lambda"), require_square(K_D, d, "K_D");
   std::unique_ptr<Core> model;
@@ -183,24 +185,25 @@ nb::object View::term(long stamp, const std::string& name) {
 namespace {
 
 Actuation actuation_from_table(const nb::dict& table, const Core& core) {
-  const auto turns = get<Matrix>(table, "transmission");
+  const auto transmission = get<Matrix>(table, "transmission");
   const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
              preload = get<Vector>(table, "preload");
-  const auto m = turns.rows();
-  require(turns.cols() == core.n && turns.allFinite(), "transmission: a finite column per coordinate is needed");
+  const auto m = transmission.rows();
+  require(transmission.cols() == core.n && transmission.allFinite(),
+          "transmission: a finite column per coordinate is needed");
   require(limit.size() == m && (limit.array() >= 0).all(), "limit: positive numbers are needed");
   require(weights, m, "weights"), require(preload, m, "preload");
   require((weights.array() > 0).all(), "weights: positive numbers are needed");
   std::vector<std::vector<Actuation::Gear>> gears(m);
   for (Eigen::Index k = 0; k < m; ++k)
     for (int j = 0; j < core.n; ++j)
-      if (turns(k, j) != 0.0) gears[k].push_back({j, turns(k, j)});
+      if (transmission(k, j) != 0.0) gears[k].push_back({j, transmission(k, j)});
   return {core, std::move(gears), get<bool>(table, "direct"),
           Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
 }
 
 // `transmission` (d, motors): u = transmission tau.
-Vector allocate(Table transmission, Given u, Given limit, Given weights, Given preload) {
+Vector allocate(MatrixArg transmission, VectorArg u, VectorArg limit, VectorArg weights, VectorArg preload) {
   const Eigen::Index d = transmission.rows(), m = transmission.cols();
   require(transmission.allFinite(), "transmission: finite numbers are needed");
   require(u, d, "u"), require(weights, m, "weights"), require(preload, m, "preload");
@@ -242,7 +245,7 @@ std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& c
     const auto drive = get<nb::dict>(table, "drive");
     control->drive = TorqueDrive{get<Vector>(drive, "resolution"), get<Vector>(drive, "rate"), Vector::Zero(motors)};
     require(control->drive->resolution, motors, "resolution");
-    require(control->drive->rate.size() == motors, "rate: a number a motor is needed");
+    require(control->drive->rate.size() == motors, "rate: a number for each motor is needed");
   }
   require(control->sampling || !(control->sensor || control->drive), "sensor and drive: a clock is needed");
   return control;

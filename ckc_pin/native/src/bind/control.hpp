@@ -1,4 +1,4 @@
-// The user's callbacks, and the control of a loop, as seen by the bindings.
+// Calls of the user's functions, and construction of controllers from Python's tables.
 #pragma once
 
 #include <exception>
@@ -9,7 +9,7 @@
 
 namespace ckc {
 
-// What a callback sees: the state of the loop, valid during the call.
+// The state of the loop that a callback can read, valid during the call.
 class View : public std::enable_shared_from_this<View> {
  public:
   // Call a function with this view. False if it raised an exception, which is stored.
@@ -20,7 +20,7 @@ class View : public std::enable_shared_from_this<View> {
 
   long calls = 0;
   bool term_requested = false;  // whether a callback has asked for a term
-  std::exception_ptr raised;
+  std::exception_ptr raised;    // exception of the last call
 
  private:
   void write_state(const MeasuredState& at);

@@ -15,11 +15,11 @@ namespace {
 
 void require_partition(const Core& core, const Indices& q, const Indices& z) {
   require_indices(q, core.n, "q"), require_indices(z, core.n, "z");
-  std::vector<bool> met(core.n, false);
+  std::vector<bool> is_listed(core.n, false);
   for (const auto& part : {q, z})
     for (int k : part) {
-      require(!met[k], "partition: a coordinate is named twice");
-      met[k] = true;
+      require(!is_listed[k], "partition: a coordinate is named twice");
+      is_listed[k] = true;
     }
   require(static_cast<int>(q.size() + z.size()) == core.n, "partition: a coordinate is missing");
   require(static_cast<int>(z.size()) <= core.constraints.closure.rows,
@@ -118,24 +118,25 @@ std::unique_ptr<Core> core_from_table(const nb::dict& table) {
 namespace {
 
 // Return all terms at one state, for comparisons.
-nb::typed<nb::dict, nb::str, Matrix> terms(Core& core, Given q_tree, Given v_tree) {
+nb::typed<nb::dict, nb::str, Matrix> terms(Core& core, VectorArg q_tree, VectorArg v_tree) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   core.set_configuration(q_tree), core.compute_D(), core.set_velocity(v_tree), core.compute_bias(),
       core.compute_coriolis();
-  nb::typed<nb::dict, nb::str, Matrix> found;
+  nb::typed<nb::dict, nb::str, Matrix> by_name;
   for (const char* name : {"phi", "J", "rho", "D_tree", "D", "bias_tree", "C_tree", "h_tree", "C", "rho_dot", "h"})
-    found[name] = term_by_name(core, name);
-  found["J_dot_v"] = core.J_dot_v, found["J_dot"] = core.constraints.J_dot;
-  return found;
+    by_name[name] = term_by_name(core, name);
+  by_name["J_dot_v"] = core.J_dot_v, by_name["J_dot"] = core.constraints.J_dot;
+  return by_name;
 }
 
-Matrix jacobian(Core& core, Given q_tree) {
+Matrix jacobian(Core& core, VectorArg q_tree) {
   require(q_tree, core.tree.nq, "q_tree");
   core.set_configuration(q_tree), core.compute_J();
   return core.constraints.J;
 }
 
-Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree, Given u_tree, bool actual) {
+Vector reduced_acceleration(Core& core, VectorArg q_tree, VectorArg q_dot, VectorArg v_tree, VectorArg u_tree,
+                            bool actual) {
   require(q_tree, core.tree.nq, "q_tree"), require(q_dot, core.d, "q_dot");
   require(v_tree, core.n, "v_tree"), require(u_tree, core.n, "u_tree");
   Vector q_ddot(core.d);
@@ -147,7 +148,7 @@ Vector reduced_acceleration(Core& core, Given q_tree, Given q_dot, Given v_tree,
   return q_ddot;
 }
 
-Vector dae_acceleration(Core& core, Given q_tree, Given v_tree, Given u_tree, Given correction) {
+Vector dae_acceleration(Core& core, VectorArg q_tree, VectorArg v_tree, VectorArg u_tree, VectorArg correction) {
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
   require(u_tree, core.n, "u_tree"), require(correction, core.constraints.closure.rows, "correction");
   Vector acceleration(core.n);

@@ -28,13 +28,14 @@ void require_state(const Linearization& linearization, In q_tree, In v_tree, In 
 }
 
 // Return the linearization at one state; None if J has lost rank.
-std::optional<nb::typed<nb::dict, nb::str, nb::any>> at(Linearization& linearization, Given q_tree, Given v_tree,
-                                                        Given u_tree, const Indices& locked) {
+std::optional<nb::typed<nb::dict, nb::str, nb::any>> linearize(Linearization& linearization, VectorArg q_tree,
+                                                               VectorArg v_tree, VectorArg u_tree,
+                                                               const Indices& locked) {
   require_state(linearization, q_tree, v_tree, u_tree, locked);
   if (!linearization.compute(q_tree, v_tree, u_tree, locked)) return {};
   linearization.solve_multipliers();
   nb::typed<nb::dict, nb::str, nb::any> result;
-  result["at"] = linearization.at, result["T"] = linearization.T, result["V"] = linearization.V,
+  result["at"] = linearization.coordinates, result["T"] = linearization.T, result["V"] = linearization.V,
   result["A"] = linearization.A, result["B"] = linearization.B;
   result["acceleration"] = linearization.acceleration.a, result["a_q"] = linearization.acceleration.by_q,
   result["a_v"] = linearization.acceleration.by_v, result["a_u"] = linearization.acceleration.by_u;
@@ -43,8 +44,8 @@ std::optional<nb::typed<nb::dict, nb::str, nb::any>> at(Linearization& lineariza
   return result;
 }
 
-// Seconds to compute A and B, minimum of several rounds.
-double seconds(Linearization& linearization, Given q_tree, Given v_tree, Given u_tree, int rounds) {
+// Return the time to compute A and B, s: minimum of several rounds.
+double seconds(Linearization& linearization, VectorArg q_tree, VectorArg v_tree, VectorArg u_tree, int rounds) {
   require_state(linearization, q_tree, v_tree, u_tree, {});
   const Vector q = q_tree, v = v_tree, u = u_tree;
   constexpr int repetitions = 20;
@@ -65,7 +66,7 @@ class Feedback {
 
   // Return the force on the tree and its derivatives with respect to q' (tangent) and v'. If there is no force,
   // return the reason; None if the derivatives are unknown.
-  nb::object at(double t, Given q_tree, Given v_tree) {
+  nb::object at(double t, VectorArg q_tree, VectorArg v_tree) {
     Core& core = *core_;
     require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree");
     core.set_configuration(q_tree, true), core.set_velocity(v_tree);
@@ -87,7 +88,8 @@ class Feedback {
 void bind_linearization(nb::module_& m) {
   nb::class_<Linearization>(m, "Linearization", "Linearizes eq. 1 at one state after another.")
       .def(nb::new_(&linearization_from_table), "core"_a, "transmission"_a)
-      .def("at", &at, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a)
+      .def("at", &linearize, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a,
+           "Return the linearization at one state; None if J has lost rank.")
       .def("seconds", &seconds, "q_tree"_a, "v_tree"_a, "u_tree"_a, "rounds"_a);
   nb::class_<Feedback>(m, "Feedback", "A controller with its motors, evaluated and differentiated at one state.")
       .def(nb::init<const nb::dict&, const nb::dict&>(), "core"_a, "control"_a,

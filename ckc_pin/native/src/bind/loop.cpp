@@ -25,7 +25,7 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
   require(tolerance > 0, "tolerance: a positive number is needed");
   if (kind == "dae") {
     const double alpha = get<double>(table, "alpha"), beta = get<double>(table, "beta");
-    require(alpha >= 0 && beta >= 0, "alpha and beta: numbers that are not negative are needed");
+    require(alpha >= 0 && beta >= 0, "alpha and beta: nonnegative numbers are needed");
     const bool projects = get<bool>(table, "projects");
     require(!table.contains("sensitivities") || (projects && alpha == 0 && beta == 0),
             "sensitivities: the DAE must be projected onto the constraint manifold");
@@ -35,8 +35,8 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
   const bool actual = get<bool>(table, "actual");
   require(epsilon > 0, "epsilon: a positive number is needed");
   if (kind == "level_set")
-    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "rhs_slack"));
-  require(kind == "printed", "formulation: dae, level_set or printed");
+    return std::make_unique<LevelSet>(core, control, epsilon, actual, tolerance, get<double>(table, "rhs_tolerance"));
+  require(kind == "printed", "formulation: the kind must be dae, level_set or printed");
   require(core.tree.roots.empty(), "eq. 8 as printed: trees with free roots are not supported");
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
@@ -66,8 +66,8 @@ Event event_from_table(const EventTable& table, const Core& core, const std::sha
 void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, const nb::dict& control,
              const nb::dict& solver, const nb::list& events) {
   loop.core = core_from_table(core);
-  auto acting = control_from_table(control, *loop.core, loop.view);
-  auto system = system_from_table(*loop.core, *acting, formulation);
+  auto owned_control = control_from_table(control, *loop.core, loop.view);
+  auto system = system_from_table(*loop.core, *owned_control, formulation);
   std::unique_ptr<SensitivityIntegrand> sensitivities;
   if (formulation.contains("sensitivities"))
     sensitivities = std::make_unique<SensitivityIntegrand>(
@@ -83,8 +83,8 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   for (nb::handle event : events)
     functions.push_back(event_from_table(nb::cast<const EventTable&>(event), *loop.core, loop.view));
   loop.core->profile.on = get<bool>(solver, "profile");
-  loop.step_loop = std::make_unique<StepLoop>(std::move(acting), std::move(system), std::move(sensitivities), options,
-                                              std::move(functions));
+  loop.step_loop = std::make_unique<StepLoop>(std::move(owned_control), std::move(system), std::move(sensitivities),
+                                              options, std::move(functions));
 }
 
 namespace {
@@ -95,7 +95,7 @@ void construct(Loop* self, const nb::dict& core, const nb::dict& formulation, co
   prepare(*self, core, formulation, control, solver, events);
 }
 
-void start(Loop& loop, double t, Given q_tree, Given v_tree, Given w) {
+void start(Loop& loop, double t, VectorArg q_tree, VectorArg v_tree, VectorArg w) {
   const Core& core = *loop.core;
   require(q_tree, core.tree.nq, "q_tree"), require(v_tree, core.n, "v_tree"),
       require(w, core.constraints.closure.rows, "w");
@@ -111,7 +111,7 @@ void use_compiled_terms(Loop& loop, const nb::tuple& library) {
   loop.step_loop->sync_core();
 }
 
-void record(Loop& loop, Given instants, RecordArray rows) {
+void record(Loop& loop, VectorArg instants, RecordArray rows) {
   require(instants, instants.size(), "instants");
   require(rows.shape(1) == static_cast<size_t>(loop.step_loop->recorder.width),
           "rows: an array with a column per recorded number is needed");
@@ -160,7 +160,7 @@ nb::object state(Loop& loop) {
 nb::object step(Loop& loop, nb::handle u, double until, double pause, bool torques) {
   if (!set_control(loop, u, torques)) return nb::none();
   const Stop stop = advance(loop, until, false, pause, std::numeric_limits<double>::infinity());
-  // Projecting the state would move the initial guesses of the steps that follow.
+  // At a pause, projecting the state would change the initial guesses of the following steps.
   return nb::make_tuple(stop, stop.reason == Stop::pause ? nb::none() : state(loop));
 }
 
@@ -220,31 +220,31 @@ std::vector<LockedJoint> locked_joints(const Loop& loop) {
 }
 
 nb::typed<nb::dict, nb::str, nb::typed<nb::tuple, int, double>> profile(const Loop& loop) {
-  nb::typed<nb::dict, nb::str, nb::typed<nb::tuple, int, double>> found;
+  nb::typed<nb::dict, nb::str, nb::typed<nb::tuple, int, double>> by_term;
   const Profile& profile = loop.core->profile;
   for (int k = 0; k < Profile::terms; ++k)
-    if (profile.calls[k]) found[Profile::names[k]] = nb::make_tuple(profile.calls[k], profile.seconds[k]);
-  return found;
+    if (profile.calls[k]) by_term[Profile::names[k]] = nb::make_tuple(profile.calls[k], profile.seconds[k]);
+  return by_term;
 }
 
 // Return y' at (t, y); for tests and timings.
-nb::object rhs(Loop& loop, double t, Given y) {
+nb::object rhs(Loop& loop, double t, VectorArg y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   Vector y_dot(system.size);
   return system.rhs(t, y, y_dot) ? nb::cast(y_dot) : nb::none();
 }
 
-nb::object jacobian(Loop& loop, double t, Given y) {
+nb::object jacobian(Loop& loop, double t, VectorArg y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
-  Matrix found;
+  Matrix by_y;
   long evaluations = 0;
-  return system.jacobian(t, y, found, evaluations) ? nb::cast(found) : nb::none();
+  return system.jacobian(t, y, by_y, evaluations) ? nb::cast(by_y) : nb::none();
 }
 
-// Seconds of a right-hand side (or Jacobian) over states, rows of (t, y), minimum of several rounds.
-double seconds(Loop& loop, Table states, int rounds, bool of_jacobian) {
+// Return the mean time of a right-hand side (or Jacobian) over states, rows of (t, y), s: minimum of several rounds.
+double seconds(Loop& loop, MatrixArg states, int rounds, bool of_jacobian) {
   System& system = *loop.step_loop->system;
   require(states.cols() == 1 + system.size && states.rows() > 0 && rounds > 0, "states: rows of (t, y) are needed");
   const Matrix columns = states.transpose();
@@ -284,8 +284,8 @@ void bind_loop(nb::module_& m) {
            nb::sig("def step(self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, "
                    "torques: bool) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], "
                    "list[int]] | None] | None"),
-           "Hold u, or motor torques, and advance. Return the stop and `state`, None at a pause; None if a number is not "
-           "finite.")
+           "Hold u, or motor torques, and advance. Return the stop and `state` (None at a pause); None if a number is "
+           "not finite.")
       .def("state", &state,
            nb::sig("def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None"),
            "Return t, the numbers (q', velocity, v' of the terms, w), q and z of the present state; None if it cannot "
@@ -319,7 +319,7 @@ void bind_loop(nb::module_& m) {
       .def("rhs", &rhs, "t"_a, "y"_a,
            nb::sig("def rhs(self, t: float, y: numpy.typing.NDArray[numpy.float64]) -> "
                    "numpy.typing.NDArray[numpy.float64] | None"),
-           "Return y' at (t, y), with what acts there; None if it does not exist.")
+           "Return y' at (t, y), including control and friction; None if it does not exist.")
       .def("jacobian", &jacobian, "t"_a, "y"_a,
            nb::sig("def jacobian(self, t: float, y: numpy.typing.NDArray[numpy.float64]) -> "
                    "numpy.typing.NDArray[numpy.float64] | None"))

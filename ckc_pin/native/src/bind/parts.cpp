@@ -27,9 +27,9 @@ nb::tuple sign_changes_of(const nb::callable& function, double start, double end
   for (Eigen::Index k = 0; k < points.size(); ++k) gap(start + (end - start) * points(k), values(k));
   RootSearch search;
   search.find(gap, {start, end}, values, sign, zero_threshold, exact.is_none() ? nullptr : &better);
-  nb::list found;
-  for (const auto& [t, direction] : search.sign_changes) found.append(nb::make_tuple(t, direction));
-  return nb::make_tuple(found, search.sign, search.on_zero);
+  nb::list sign_changes;
+  for (const auto& [t, direction] : search.sign_changes) sign_changes.append(nb::make_tuple(t, direction));
+  return nb::make_tuple(sign_changes, search.sign, search.on_zero);
 }
 
 // A predictor of a mechanism that starts from a configuration.
@@ -38,16 +38,16 @@ struct BoundPredictor {
   Chart chart;
   Predictor predictor;
 
-  BoundPredictor(const nb::typed<nb::dict, nb::str, nb::any>& table, Given q_tree, double epsilon)
+  BoundPredictor(const nb::typed<nb::dict, nb::str, nb::any>& table, VectorArg q_tree, double epsilon)
       : core(core_from_table(table)), predictor(*core, epsilon) {
     core->set_configuration(q_tree), core->compute_rho();
     chart.reset(*core, q_tree), predictor.reset(*core, q_tree);
   }
-  void add(double t, Given q_tree, Given v_tree, Given w) {
+  void add(double t, VectorArg q_tree, VectorArg v_tree, VectorArg w) {
     core->set_configuration(q_tree), core->compute_rho();
     predictor.add(t, *core, q_tree, v_tree, w);
   }
-  Vector predict(double t, Given numbers, Given w) {
+  Vector predict(double t, VectorArg numbers, VectorArg w) {
     Vector q_tree(core->tree.nq);
     predictor.predict(t, numbers, chart, *core, w, q_tree);
     return q_tree;
@@ -70,12 +70,12 @@ nb::typed<nb::tuple, Matrix, Matrix, Matrix> log_jacobian(const Vector& u, const
 }
 
 // Return the rank monitor's smallest singular value and its rate at a state of a DAE.
-nb::typed<nb::tuple, double, double> rank(Loop& loop, Given y) {
+nb::typed<nb::tuple, double, double> rank(Loop& loop, VectorArg y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   system.sync_core_at_last_rhs(0.0, y);
-  const RankMonitor::Rank found = RankMonitor(*loop.core).evaluate(system);
-  return nb::make_tuple(found.value, found.rate);
+  const RankMonitor::Rank sigma_min = RankMonitor(*loop.core).evaluate(system);
+  return nb::make_tuple(sigma_min.value, sigma_min.rate);
 }
 
 // Return the end of one collocation step from the present state.
@@ -89,7 +89,7 @@ Vector collocate(Loop& loop, double span, int stages) {
   return y;
 }
 
-std::optional<Vector> rate_on_manifold(Loop& loop, double t, Given y) {
+std::optional<Vector> rate_on_manifold(Loop& loop, double t, VectorArg y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   Vector y_dot(system.size);
@@ -97,7 +97,7 @@ std::optional<Vector> rate_on_manifold(Loop& loop, double t, Given y) {
 }
 
 // Project (q', v') onto the constraint manifold.
-std::optional<std::pair<Vector, Vector>> project(Loop& loop, double t, Given y) {
+std::optional<std::pair<Vector, Vector>> project(Loop& loop, double t, VectorArg y) {
   System& system = *loop.step_loop->system;
   require(y, system.size, "y");
   if (!system.sync_core(t, y)) return {};
@@ -126,7 +126,8 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
   m.def("hermite_weights", &weights, "times"_a, "t"_a,
         "Return the weights of values and of derivatives of Hermite interpolation.");
   nb::class_<BoundPredictor>(m, "Predictor", "Extrapolates the configuration as a starting point of the projection.")
-      .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&, Given, double>(), "core"_a, "q_tree"_a, "epsilon"_a)
+      .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&, VectorArg, double>(), "core"_a, "q_tree"_a,
+           "epsilon"_a)
       .def("add", &BoundPredictor::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("predict", &BoundPredictor::predict, "t"_a, "numbers"_a, "w"_a);
   binding

@@ -1,4 +1,4 @@
-// The loop that Python sees: the step loop with its core and callbacks, and the values that it returns.
+// Python's `Loop`: the step loop with its core and callbacks, and the values that it returns.
 #pragma once
 
 #include "bind/control.hpp"
@@ -14,7 +14,7 @@ struct Loop {
   std::unique_ptr<Core> core;
   std::unique_ptr<StepLoop> step_loop;
   SensitivityIntegrand* sensitivities = nullptr;  // the step loop's integrand; null without sensitivities
-  nb::object rows;
+  nb::object rows;                                // the array of the record, kept alive
   PartitionLists partition_lists;
   long rhs_before_compiled = 0;  // right-hand sides before compiled terms were used
 };
@@ -31,12 +31,12 @@ struct StepFailure {
   std::string message;  // of the controller
   Vector u;             // of the controller, if it is not finite
   double sigma_min;     // smallest singular value of phi_z; NaN if unknown
-  double margin;        // that over |J|
+  double margin;        // sigma_min over |J|
   Vector q_tree;
   Indices q, z;
 };
 
-// A joint that sticks or is at a stop, with its holding force and the bounds of that.
+// A joint that sticks or is at a stop, with its holding force and the bounds of the force.
 struct LockedJoint {
   int coordinate;
   double force, lower, upper;

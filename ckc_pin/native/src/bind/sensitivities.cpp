@@ -49,10 +49,10 @@ std::optional<Vector> time_shifts(Loop& loop, int coordinate, bool of_rate) {
 std::optional<Vector> velocity_and_acceleration(Loop& loop) {
   StepLoop& step_loop = *loop.step_loop;
   const int n = loop.core->n;
-  Vector a(n), whole(2 * n);
+  Vector a(n), rates(2 * n);
   if (!step_loop.sync_core() || !step_loop.system->acceleration(step_loop.t(), a)) return {};
-  whole << step_loop.system->velocity, a;
-  return whole;
+  rates << step_loop.system->velocity, a;
+  return rates;
 }
 
 }  // namespace

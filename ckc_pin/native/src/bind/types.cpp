@@ -16,10 +16,10 @@ void bind_enums(nb::module_& m) {
       .value("PAUSE", Stop::pause, "the interpreter should run")
       .value("RHS_BUDGET", Stop::rhs_budget, "the budget of right-hand sides is used up")
       .value("WALL_BUDGET", Stop::wall_budget, "the budget of time is used up")
-      .value("PACE", Stop::pace, "the rest would take too many right-hand sides")
+      .value("PACE", Stop::pace, "the remaining motion would take too many right-hand sides")
       .value("MIN_STEP", Stop::min_step, "the step size fell below its minimum")
       .value("STEP", Stop::step, "no step can be made, see StepFailure")
-      .value("RANK", Stop::rank, "J loses rank, and that cannot be crossed")
+      .value("RANK", Stop::rank, "J loses rank, and the position cannot be crossed")
       .value("COORDINATES_SINGULAR", Stop::coordinates_singular, "phi_z is singular: q does not determine z")
       .value("ENERGY", Stop::energy, "the energy of a conservative motion changes, however short the step")
       .value("CONTROL", Stop::control, "the controller has no u")
@@ -38,7 +38,7 @@ void bind_enums(nb::module_& m) {
       .value("Z_INACCURATE", RhsFailure::z_inaccurate, "z does not agree with its rates")
       .value("ALLOCATION_NOT_DIFFERENTIABLE", RhsFailure::allocation_not_differentiable)
       .value("TORQUE_POLE", RhsFailure::torque_pole, "a motor jumps from one limit to the other");
-  nb::enum_<JointTransition::Kind>(m, "JointTransitionKind", "How the mode of a joint changes.")
+  nb::enum_<JointTransition::Kind>(m, "JointTransitionKind", "A transition between joint modes.")
       .value("STICKS", JointTransition::sticks)
       .value("SLIDES", JointTransition::slides)
       .value("TOUCHES", JointTransition::touches)
@@ -54,7 +54,7 @@ void bind_enums(nb::module_& m) {
       .value("TIME", NonDifferentiableEvent::time, "simultaneous events move to different times")
       .value("RESTITUTION", NonDifferentiableEvent::restitution, "stops with different restitution reflect at once")
       .value("MARGINALLY_LOCKED", NonDifferentiableEvent::marginally_locked, "a holding force is at its bound");
-  nb::enum_<Core::Parameter>(m, "CoreParameter", "Kinds of parameters that a core can be given.")
+  nb::enum_<Core::Parameter>(m, "CoreParameter", "Kinds of parameters of a core.")
       .value("GRAVITY", Core::Parameter::gravity)
       .value("OFFSET", Core::Parameter::offset)
       .value("MASS", Core::Parameter::mass)
@@ -75,7 +75,7 @@ void bind_enums(nb::module_& m) {
       .value("CONSTANT", Core::Parameter::constant)
       .value("COMPILED", Core::Parameter::compiled, "the parameters of the compiled terms");
   using Kind = ParameterDerivative;
-  nb::enum_<Kind::Kind>(m, "ParameterDerivativeKind", "How a parameter acts.")
+  nb::enum_<Kind::Kind>(m, "ParameterDerivativeKind", "The quantity that depends on a parameter.")
       .value("PLACEMENT", Kind::placement)
       .value("INERTIA", Kind::inertia)
       .value("GRAVITY", Kind::gravity)
@@ -126,7 +126,7 @@ void bind_types(nb::module_& m) {
       .def_ro("message", &StepFailure::message, "of the controller")
       .def_ro("u", &StepFailure::u, "of the controller, if it is not finite")
       .def_ro("sigma_min", &StepFailure::sigma_min, "smallest singular value of phi_z")
-      .def_ro("margin", &StepFailure::margin, "that over the norm of J")
+      .def_ro("margin", &StepFailure::margin, "sigma_min over the norm of J")
       .def_ro("q_tree", &StepFailure::q_tree)
       .def_ro("q", &StepFailure::q)
       .def_ro("z", &StepFailure::z);
@@ -145,11 +145,11 @@ void bind_types(nb::module_& m) {
       .def_prop_ro("quantity", [](const EventTable& table) { return table.event.quantity; })
       .def_prop_ro("coordinate", [](const EventTable& table) { return table.event.coordinate; })
       .def_prop_ro("stop", [](const EventTable& table) { return table.event.stop; });
-  nb::class_<EventOccurrence>(m, "EventOccurrence", "An event has occurred.")
+  nb::class_<EventOccurrence>(m, "EventOccurrence", "The occurrence of an event.")
       .def_ro("t", &EventOccurrence::t)
       .def_ro("event", &EventOccurrence::event, "index of the event")
       .def_ro("direction", &EventOccurrence::direction, "1: rising, -1: falling");
-  nb::class_<JointTransition>(m, "JointTransition", "The mode of a joint has changed.")
+  nb::class_<JointTransition>(m, "JointTransition", "A transition of a joint's mode.")
       .def_ro("t", &JointTransition::t)
       .def_ro("coordinate", &JointTransition::coordinate)
       .def_ro("kind", &JointTransition::kind)

@@ -6,9 +6,9 @@
 namespace ckc {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-constexpr double u_rounding = 1e-13;           // relative error allowed in u, scaled
-constexpr double curvature_tolerance = 1e-12;  // of the dual's largest curvature: below it a direction counts as flat
-constexpr double penalty = 1e-7;               // relative to that curvature, of missing u where it cannot be reached
+constexpr double u_rounding = 1e-13;           // accepted relative error of the scaled u
+constexpr double curvature_tolerance = 1e-12;  // the dual is flat below it, relative to its largest curvature
+constexpr double penalty = 1e-7;               // weight of a deviation from u, relative to the largest curvature
 constexpr double full_step_tolerance = 1e-6;   // a Newton step whose length differs from 1 by less is a full step
 constexpr int max_newton_steps = 50;           // random problems need at most 10
 
@@ -20,9 +20,9 @@ Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector 
       redundant_(motors != d),
       eigen_(d) {
   if (redundant_)
-    factor_.shape(motors, d, std::vector<Indices>(motors));
+    factor_.set_pattern(motors, d, std::vector<Indices>(motors));
   else
-    factor_.shape(motors, motors, full_pattern(motors));
+    factor_.set_pattern(motors, motors, full_pattern(motors));
   scaled_.setZero(redundant_ ? motors : d, redundant_ ? d : motors), curvature_.setZero(d, d);
   for (Vector* x : {&residual_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
   for (Vector* x : {&unlimited_, &unclamped_, &tau_direction_, &becomes_free_, &becomes_limited_}) x->setZero(motors);
@@ -47,7 +47,8 @@ void Allocation::allocate(const Matrix& transmission, In u, Out tau) {
   tau = unlimited_, clamp(tau);
 }
 
-// With a `penalty_weight` (relative to the largest curvature), u may be missed at a quadratic cost.
+// Solve by Newton's method on the dual. With a `penalty_weight` (relative to the largest curvature), deviations from u
+// have a quadratic cost. False if that fails or u is out of reach.
 bool Allocation::solve_with_limits(const Matrix& transmission, In u, Out tau, double penalty_weight) {
   const auto m = transmission.rows();
   for (Eigen::Index i = 0; i < row_scale_.size(); ++i)

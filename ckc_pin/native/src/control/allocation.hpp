@@ -1,4 +1,4 @@
-// Allocation of a generalized force to motors.
+// Allocation of a generalized force to motors with torque limits.
 #pragma once
 
 #include <Eigen/Eigenvalues>
@@ -11,8 +11,8 @@ namespace ckc {
 // subject to u = transmission^T tau and the torque limits. The dual of this box QP is concave and piecewise quadratic
 // in d numbers. Newton's method with an exact line search solves it in finitely many steps.
 //
-// If no torques within the limits give u, the deviation from u is penalized. Each row of u is measured by what one
-// unit of all motors contributes to it, so the torques stay almost continuous there.
+// If no torques within the limits give u, the deviation from u is penalized, so that the torques stay almost
+// continuous. Rows of u are scaled by the norms of their rows of transmission^T.
 class Allocation {
  public:
   Allocation(int motors, int d, Vector limit, Vector weights, Vector preload);
@@ -26,17 +26,21 @@ class Allocation {
  private:
   bool solve_with_limits(const Matrix& transmission, In u, Out tau, double penalty_weight);
   bool is_out_of_reach(In u, double tolerance) const;
-  double line_search(double penalty_curvature);  // step length that maximizes the dual; infinite if it is unbounded
+  double line_search(double penalty_curvature);  // step length that maximizes the dual; infinite if unbounded
 
   const Vector weights_, preload_, scale_;
   const bool redundant_;
   Factor factor_;
   Matrix scaled_, curvature_;
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;
-  Vector unlimited_, residual_, row_scale_, multiplier_, direction_, coefficients_, unclamped_, tau_direction_,
-      becomes_free_, becomes_limited_, breakpoints_;
-  Indices free_;                         // 1 for a motor within its limits
+  Vector unlimited_;                     // torques without limits
+  Vector multiplier_, direction_;        // dual variables, (d); direction of the line search
   double directional_derivative_ = 0.0;  // of the dual along direction_
+  Vector residual_, row_scale_, coefficients_;
+  Vector unclamped_, tau_direction_;       // torques before clamping, and their derivatives along direction_
+  Vector becomes_free_, becomes_limited_;  // step lengths at which a motor leaves a limit and reaches the other
+  Vector breakpoints_;                     // both, sorted
+  Indices free_;                           // by motor: 1 within its limits, else 0
 };
 
 }  // namespace ckc

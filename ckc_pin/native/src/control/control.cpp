@@ -6,7 +6,7 @@
 
 namespace ckc {
 
-constexpr double max_relative_u_error = 1e-9;  // motors reproduce u up to this; a larger error means that limits act
+constexpr double max_relative_u_error = 1e-9;  // of the motors; a larger deviation from u means that limits act
 
 SetPointController::SetPointController(Matrix K_P, Matrix K_V, Vector q_d, Vector h_d, double potential_d)
     : K_P_(std::move(K_P)),
@@ -30,9 +30,9 @@ double SetPointController::lyapunov(const MeasuredState& at, double potential_en
   product_.noalias() = at.core.D * at.rate;  // independent of the coordinates of the motion
   const double kinetic = 0.5 * at.rate.dot(product_);
   e_ = at.q - q_d_;
-  const double fallen = potential_energy - potential_d_ - e_.dot(h_d_);
+  const double potential = potential_energy - potential_d_ - e_.dot(h_d_);
   product_.noalias() = K_P_ * e_;
-  return kinetic + fallen + 0.5 * e_.dot(product_);
+  return kinetic + potential + 0.5 * e_.dot(product_);
 }
 
 TrackingController::TrackingController(Matrix Lambda, Matrix K_D, std::unique_ptr<Trajectory> desired,
@@ -193,10 +193,10 @@ MeasuredState Control::in_fixed_partition(const MeasuredState& at) {
   return {at.t, at.core, q_, q_dot_, at.v_tree, at.rate};
 }
 
-bool SetPointController::derivatives(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) {
-  for (size_t k = 0; k < own.size(); ++k) {
+bool SetPointController::derivatives(Core&, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) {
+  for (size_t k = 0; k < fixed_q.size(); ++k) {
     const auto column = static_cast<Eigen::Index>(k);
-    by_q.col(own[k]) = -K_P_.col(column), by_v.col(own[k]) = -K_V_.col(column);
+    by_q.col(fixed_q[k]) = -K_P_.col(column), by_v.col(fixed_q[k]) = -K_V_.col(column);
   }
   return true;
 }
@@ -209,8 +209,8 @@ void SetPointController::gain_derivative(const MeasuredState& at, const Matrix& 
   derivative = -derivative;
 }
 
-// Actuators at their limits do not respond to the state. Motors on other coordinates than q share u: as long as they
-// produce it exactly, it does not matter how. Otherwise the motors within their limits respond as they would without
+// Motors at their limits do not respond to the state. As long as motors on other coordinates than q produce u, its
+// derivatives do not depend on the allocation. Otherwise the motors within their limits respond as they would without
 // limits.
 bool Control::derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force) {
   const auto n = u_tree.size();
@@ -233,8 +233,8 @@ bool Control::derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force)
   return true;
 }
 
-// Let f be the forces of the motors without limits, f + J^T lambda = u on q. The derivative of tau follows from du =
-// rho^T (df + d(J^T) lambda).
+// Let f be the forces of the motors without limits, and f + J^T lambda = u on q. The derivative of tau follows from
+// du = rho^T (df + d(J^T) lambda).
 bool Control::limited_motor_derivatives(Core& core, Matrix& by_q, Matrix& by_v) {
   core.compute_rho();
   const auto n = u_tree.size();
@@ -306,7 +306,7 @@ bool Control::evaluate_sample(const MeasuredState& at) {
   const MeasuredState fixed = in_fixed_partition(at);
   if (sensor) sensor->measure(fixed.q, fixed.q_dot, sampling->period);
   if (sensor && sensor->observer && !sensor->project_observer(at.core.q_tree)) {
-    failure.message = "the loops do not close at what the sensors say of q";
+    failure.message = "the loops cannot be closed at the measured q";
     return false;
   }
   const MeasuredState state =

@@ -1,5 +1,5 @@
-// Control of a mechanism: no control, a constant u, a controller of the paper or of the user, sampled or continuous,
-// acting through motors with limits.
+// Control of a mechanism: none, a constant u, or a controller of the paper or of the user, sampled or continuous,
+// through motors with limits.
 #pragma once
 
 #include <cmath>
@@ -20,31 +20,31 @@ struct MeasuredState {
   double t;
   Core& core;
   const Vector &q, &q_dot;
-  const Vector& v_tree;  // velocity that C uses
+  const Vector& v_tree;  // velocity at which C is evaluated
   const Vector& rate;    // q_dot of the core's partition
 };
 
 // Why a controller has no u.
 struct ControlFailure {
   std::string message;
-  Vector u;             // a value that is not finite
-  bool raised = false;  // the callback has raised an exception, which the caller stores
+  Vector u;             // the controller's output, if it is not finite
+  bool raised = false;  // the callback raised an exception, which the bindings have stored
 };
 
 class Controller {
  public:
   virtual ~Controller() = default;
-  // Compute eq. 6's force u, or motor torques. False if there is none; `failure` says why.
+  // Compute eq. 6's force u, or motor torques. If there is none, return false and set `failure`.
   virtual bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) = 0;
   virtual bool outputs_torques() const { return false; }
-  // Value of its Lyapunov function, NaN if there is none. `w`: present value of phi.
+  // Value of the Lyapunov function, NaN if there is none. `w`: present value of phi.
   virtual double lyapunov(const MeasuredState&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it uses terms in the fixed partition, not only q and q_dot.
   virtual bool needs_terms() const { return true; }
-  // Derivatives of the last u with respect to q' (tangent) and v', at the core's state. The matrices are zero on
-  // entry; the indices are those of q. False if unknown.
-  virtual bool derivatives(Core&, const Indices&, Matrix&, Matrix&) { return false; }
-  // Derivative of u for a change of the gains (of positions, of rates); requires `derivatives`.
+  // Derivatives of the last u with respect to q' (tangent) and v', at the core's state. The matrices are zero on entry.
+  // False if unknown.
+  virtual bool derivatives(Core&, const Indices& /*fixed_q*/, Matrix& /*by_q*/, Matrix& /*by_v*/) { return false; }
+  // Directional derivative of u with respect to the gains (of positions, of rates); requires `derivatives`.
   virtual void gain_derivative(const MeasuredState&, const Matrix&, const Matrix&, Out derivative) {
     derivative.setZero();
   }
@@ -57,7 +57,7 @@ class SetPointController : public Controller {
   bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override;
   double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
   bool needs_terms() const override { return false; }
-  bool derivatives(Core&, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  bool derivatives(Core&, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override;
   void gain_derivative(const MeasuredState& at, const Matrix& K_P, const Matrix& K_V, Out derivative) override;
 
  private:
@@ -67,15 +67,15 @@ class SetPointController : public Controller {
   Vector e_, product_;
 };
 
-// Tracking controller, eq. 16. `model`: the controller's own model of the plant, evaluated at the measured q' and at
-// rho q_dot, or at the "actual" velocity.
+// Tracking controller, eq. 16. `model`: the plant as the controller knows it, evaluated at the measured q' and at
+// rho q_dot or the "actual" velocity; null: the plant itself.
 class TrackingController : public Controller {
  public:
   TrackingController(Matrix Lambda, Matrix K_D, std::unique_ptr<Trajectory> desired, std::unique_ptr<Core> model,
                      bool actual);
   bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override;
   double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
-  bool derivatives(Core& plant, const Indices& own, Matrix& by_q, Matrix& by_v) override;
+  bool derivatives(Core& plant, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override;
   void gain_derivative(const MeasuredState& at, const Matrix& Lambda, const Matrix& K_D, Out derivative) override;
 
  private:
@@ -84,7 +84,7 @@ class TrackingController : public Controller {
   std::unique_ptr<Core> model_;
   bool actual_;
   bool errors(const MeasuredState& at);
-  Vector e_, e_dot_, v_, a_, r_;  // at the last measured state; `derivatives` uses them
+  Vector e_, e_dot_, v_, a_, r_;  // errors and reference motion at the last measured state, for `derivatives`
   Vector product_, Lambda_e_, v_model_;
 };
 
@@ -117,7 +117,7 @@ class Actuation {
   void apply_torques(Out tau, Out u_tree) const;  // clamps the requested torques
   void clamp(Out tau) const { allocation_.clamp(tau); }
   const std::vector<std::vector<Gear>> gears;
-  const bool is_direct;  // the motors act on q directly, so u is their torque
+  const bool is_direct;  // one motor on each coordinate of q, so that tau = u
   bool is_redundant() const { return allocation_.is_redundant(); }
   bool is_at_limit(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
 
@@ -131,10 +131,10 @@ class Actuation {
 struct Sampling {
   double period = 0.0, delay = 0.0;
   Vector times;  // sample times, if they are not periodic
-  // false: piecewise smooth control without a hold; only its derivatives jump at the instants
+  // False: no hold. The control is piecewise smooth, and its derivatives jump at the instants.
   bool holds_output = true;
   long next_sample = 0;                        // index of the next sample
-  int samples_taken = 0, outputs_applied = 0;  // at the last processed instant
+  int samples_taken = 0, outputs_applied = 0;  // at the last instant
   // ring buffer of outputs waiting for their delay: (time, u)
   std::vector<std::pair<double, Vector>> queue;
   size_t queue_begin = 0, queue_size = 0;
@@ -153,7 +153,7 @@ class Control {
   std::optional<Sampling> sampling;
   std::optional<Sensor> sensor;
   std::optional<TorqueDrive> drive;
-  Vector constant;  // (d), or one per motor
+  Vector constant;  // constant or held output: u, (d), or one torque per motor
   bool constant_is_torque = false;
   ControlFailure failure;
   Vector u, tau, u_tree;  // present values: (d), (motors), (n)
@@ -162,24 +162,25 @@ class Control {
   bool is_active() const { return law || !constant.isZero(0); }
   // Replace the constant u or torques. False if they are unchanged.
   bool set_constant(In value, bool outputs_torques);
-  // Whether the motion must stay in the user's partition: the controller or its caller uses terms in it, or u is eq.
-  // 6's force, which depends on it. Motor torques do not.
+  // Whether the motion must stay in the user's partition, because the control uses terms of that partition or is given
+  // as eq. 6's force in it. Motor torques do not depend on a partition.
   bool needs_fixed_partition() const;
   // Whether evaluating the control between samples needs more of the state than q and q_dot.
   bool needs_terms() const {
     return is_active() && ((is_feedback() && law->needs_terms()) || !(actuation_.is_direct || outputs_torques()));
   }
-  // Motors on other coordinates than q, some of them at their limits: they do not produce u exactly. Set by
+  // Motors on other coordinates than q that do not produce the requested u, because some are at their limits. Set by
   // `derivatives`.
   struct LimitedMotors {
     bool exist = false;
-    Matrix response;     // (motors, d): change of the torques for a change of the requested u
-    Vector tau, lambda;  // torques without limits; multipliers that balance them with u on q
-    Matrix by_q, by_v;   // (motors, n): derivatives of the torques
+    Matrix response;    // (motors, d): derivative of the torques with respect to the requested u
+    Vector tau;         // torques without limits
+    Vector lambda;      // multipliers with which these torques are equivalent to u on q
+    Matrix by_q, by_v;  // (motors, n): derivatives of the torques
   };
   LimitedMotors limited_motors;
-  // Derivatives of the last u_tree with respect to q' and v'. `force` receives the applied force; eq. 6's force is
-  // represented as acting on q alone. False if unknown.
+  // Derivatives with respect to q' and v' of a force that is equivalent to the last u_tree: `force`, which is eq. 6's
+  // force on q where the motors produce it. False if unknown.
   bool derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
   // Whether component k of u responds to the state, i.e. its motor is not at its limit.
   bool responds(Eigen::Index k) const { return !(is_direct() && is_at_limit(k)); }
@@ -191,13 +192,14 @@ class Control {
   // Whether u depends on the state between samples.
   bool is_feedback() const { return law && !(sampling && sampling->holds_output); }
   bool compute(const MeasuredState& at);
-  bool sample(const MeasuredState& at, bool& changed);  // at an instant of the clock
-  void recover_u(Core& core);                           // eq. 6's force equivalent to what acts, in the fixed partition
+  // At an instant of the clock: take a sample that is due, and apply the outputs whose delay has elapsed.
+  bool sample(const MeasuredState& at, bool& changed);
+  void recover_u(Core& core);  // sets u, in the fixed partition, from prescribed motor torques
   double lyapunov(const MeasuredState& at, double potential_energy, In w);
 
  private:
   bool evaluate_law(const MeasuredState& at, Out u);
-  bool evaluate_sample(const MeasuredState& at);  // into sample_
+  bool evaluate_sample(const MeasuredState& at);  // sets sample_
   bool check_finite(In u);                        // stores u in `failure` if it is not finite
   MeasuredState in_fixed_partition(const MeasuredState& at);
   bool limited_motor_derivatives(Core& core, Matrix& by_q, Matrix& by_v);

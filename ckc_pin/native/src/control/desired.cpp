@@ -42,8 +42,8 @@ bool SplineTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
 }
 
 constexpr int max_newton_steps = 20;
-constexpr double max_newton_step = 0.5;  // rad or m; longer steps are not local
-constexpr double largest_weight = 10.0;  // largest sum of |weights| in an interpolation between knots
+constexpr double max_newton_step = 0.5;  // rad or m; longer steps may change the branch
+constexpr double max_weight_sum = 10.0;  // of |weights| in an interpolation between knots
 
 PointTrajectory::PointTrajectory(Task task, std::unique_ptr<Trajectory> path, Indices q, Knots knots, double tolerance)
     : tree_(task.model, task.q_index),
@@ -57,7 +57,7 @@ PointTrajectory::PointTrajectory(Task task, std::unique_ptr<Trajectory> path, In
   q_tree_.setZero(tree_.nq), J_dot_v_.setZero(constraints_.closure.rows), J_.setZero(n, n), units_.setOnes(n);
   for (Vector* x : {&v_, &a_, &target_, &residual_, &step_}) x->setZero(n);
   for (Vector* x : {&x_, &x_dot_, &x_ddot_}) x->setZero(3);
-  factor_.shape(n, n, full_pattern(n));
+  factor_.set_pattern(n, n, full_pattern(n));
   rates_.setZero(n, knots_.times.size()), rate_is_known_.assign(knots_.times.size(), 0);
 }
 
@@ -70,15 +70,15 @@ bool PointTrajectory::update_rows() {
   return !factor_.singular() && constraints_.phi.allFinite();
 }
 
-// Newton's method from q_tree_. False if a step is not local or does not contract.
+// Newton's method from q_tree_. False if a step is too long or does not contract.
 bool PointTrajectory::solve() {
   const double tolerance = tolerance_ * tree_.tolerance_scale(q_tree_, units_);
   double previous_size = 0.0;
   for (int k = 0; k < max_newton_steps; ++k) {
-    const bool exists = update_rows();
+    const bool is_regular = update_rows();
     for (int i = 0; i < tree_.n; ++i) residual_(i) = constraints_.phi(task_.psi[i]) - target_(i);
     const double size = residual_.lpNorm<Eigen::Infinity>();
-    if (!exists || (k && !(size <= std::max(0.5 * previous_size, tolerance)))) return false;
+    if (!is_regular || (k && !(size <= std::max(0.5 * previous_size, tolerance)))) return false;
     if (size <= tolerance) return true;
     factor_.solve(residual_, step_);
     if (!(step_.lpNorm<Eigen::Infinity>() <= max_newton_step)) return false;
@@ -93,7 +93,7 @@ void PointTrajectory::set_target(const Vector& path, const Vector* level) {
   for (int i = 0; i < tree_.n; ++i) target_(i) = task_.axis[i] >= 0 ? path(task_.axis[i]) : level ? (*level)(i) : 0.0;
 }
 
-bool PointTrajectory::knot_rate(Eigen::Index knot) {
+bool PointTrajectory::compute_knot_rate(Eigen::Index knot) {
   if (rate_is_known_[knot]) return true;
   q_tree_ = knots_.configurations.col(knot);
   if (!(*path_)(knots_.times(knot), x_, x_dot_, x_ddot_) || !update_rows()) return false;
@@ -107,10 +107,10 @@ bool PointTrajectory::predict(double t, Eigen::Index first) {
   const auto regular = knots_.times.size() - (std::isfinite(knots_.end) ? 1 : 0);
   double a[nodes], b[nodes], sum = 0.0;
   for (int i = 0; i < nodes; ++i)
-    if (first + i >= regular || !knot_rate(first + i)) return false;
+    if (first + i >= regular || !compute_knot_rate(first + i)) return false;
   hermite_weights(knots_.times.data() + first, nodes, t, a, b);
   for (double weight : a) sum += std::abs(weight);
-  if (!(sum < largest_weight)) return false;
+  if (!(sum < max_weight_sum)) return false;
   q_tree_ = knots_.configurations.col(first);
   step_.setZero();
   for (int i = 0; i < nodes; ++i) {

@@ -46,10 +46,10 @@ class PointTrajectory : public Trajectory {
   struct Task {
     std::string model;      // in Pinocchio's binary format
     Indices q_index;        // for each tangent coordinate, its index in q'
-    Closure closure;        // contains the rows of Psi
-    Indices psi;            // its n rows that determine q'
-    std::vector<int> axis;  // by row of psi: which of x, y, z it prescribes, -1 for a constant
-    Vector level;           // values of psi; zero where the path prescribes them
+    Closure closure;        // rows of the loops and coordinates of the point
+    Indices psi;            // the n rows of `closure` that make up Psi and determine q'
+    std::vector<int> axis;  // by row of Psi: the coordinate of the path that it equals, -1 for a constant
+    Vector level;           // constant values of Psi; zero where the path prescribes them
   };
   // Configurations along the path, (nq, count), at their times. After `end` the path leaves the workspace.
   struct Knots {
@@ -64,11 +64,11 @@ class PointTrajectory : public Trajectory {
 
  private:
   static constexpr int nodes = 3;  // points interpolated between knots, by polynomials of degree 5
-  bool update_rows();              // at q_tree_; false if they are not finite or singular
-  bool solve();
-  void set_target(const Vector& path, const Vector* level);  // right-hand sides of the rows of psi
-  bool knot_rate(Eigen::Index knot);
-  bool predict(double t, Eigen::Index first);  // q_tree_ from the knots beginning with `first`
+  bool update_rows();              // Psi and its Jacobian at q_tree_; false if not finite or singular
+  bool solve();                    // for q_tree_
+  void set_target(const Vector& path, const Vector* level);  // target_: values (or rates) that Psi should have
+  bool compute_knot_rate(Eigen::Index knot);
+  bool predict(double t, Eigen::Index first);  // sets q_tree_ from the knots beginning with `first`
 
   Tree tree_;
   ConstraintRows constraints_;
@@ -77,8 +77,8 @@ class PointTrajectory : public Trajectory {
   Indices q_;
   Knots knots_;
   double tolerance_;
-  Matrix rates_;                     // (n, count): rates at the knots, computed on demand
-  std::vector<char> rate_is_known_;  // the last knot may be singular
+  Matrix rates_;                     // (n, count): rates at the knots, computed when they are needed
+  std::vector<char> rate_is_known_;  // by knot
   Vector q_tree_, units_, v_, a_, target_, residual_, step_, J_dot_v_, x_, x_dot_, x_ddot_;
   Matrix J_;
   Factor factor_;

@@ -5,7 +5,8 @@
 namespace ckc {
 
 constexpr int max_newton_steps = 12;
-constexpr double max_newton_step = 0.5, newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
+constexpr double max_newton_step = 0.5;    // rad, or relative to the mechanism's size; longer steps are not local
+constexpr double newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
 
 // SplitMix64 of Steele, Lea and Flood, upper 53 bits.
 double Noise::uniform() {

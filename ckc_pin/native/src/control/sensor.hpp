@@ -8,8 +8,8 @@
 
 namespace ckc {
 
-// Normal random numbers that are identical on every machine. Of the C library it uses only sqrt, which IEEE 754
-// defines.
+// Normal random numbers that are identical on every machine. The only function of the C library that they use is sqrt,
+// which IEEE 754 defines exactly.
 class Noise {
  public:
   void reset(std::uint64_t seed) { state_ = seed; }
@@ -20,8 +20,8 @@ class Noise {
   std::uint64_t state_ = 0;
 };
 
-// Encoders with resolution and noise. Rates are measured or differenced, then filtered. Evaluated at the clock's
-// instants.
+// Encoders with resolution and noise, evaluated at the samples. Rates are measured or differentiated numerically, then
+// filtered.
 class Sensor {
  public:
   Vector resolution, q_noise, q_dot_noise;  // (d); 0 where there is none
@@ -31,7 +31,7 @@ class Sensor {
   std::unique_ptr<Core> observer;  // mechanism at the measured configuration
 
   void reset();
-  // Measure q and q_dot, which are stored in `q` and `q_dot`.
+  // Set `q` and `q_dot` to measured values.
   void measure(In q_true, In q_dot_true, double period);
   // Project the observer onto the constraint manifold at the measured q, starting from q_tree. False if that fails.
   bool project_observer(In q_tree);

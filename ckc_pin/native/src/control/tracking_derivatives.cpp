@@ -23,7 +23,7 @@ bool TrackingController::derivatives(Core& plant, const Indices& fixed_q, Matrix
   const Vector v1 = uses_own_velocity ? Vector(core.rho * (r_ + v_)) : plant.v_tree, v2 = core.rho * v_;
   core.compute_J_dot(v1);
   const Matrix J = core.constraints.J, &rho = core.rho;
-  // complete the z rows of x so that J x = -residual, given its q rows
+  // Compute the z rows of x from its q rows, so that J x = -residual.
   const auto complete_dependent = [&](const Matrix& residual, Matrix& x) {
     Vector step(n), total_residual(m);
     for (Eigen::Index k = 0; k < x.cols(); ++k) {

@@ -10,12 +10,12 @@ namespace ckc {
 
 namespace qp = proxsuite::proxqp;
 
-constexpr double solver_tolerance = 1e-12;  // of a problem scaled to numbers of about one
-constexpr double max_residual = 1e-11;      // of the largest |x|: accepted optimality residual
-constexpr double bound_tolerance = 1e-9;    // of the largest |x|: distance at which a variable counts as at its bound
-constexpr double infinite_bound = 1e8;      // stands for an infinite bound
+constexpr double solver_tolerance = 1e-12;  // the problem is scaled so that its numbers are about one
+constexpr double max_residual = 1e-11;      // accepted optimality residual, relative to the largest |x|
+constexpr double bound_tolerance = 1e-9;    // a variable this close to its bound is at it; relative to the largest |x|
+constexpr double infinite_bound = 1e8;      // replaces infinite bounds, which ProxQP does not accept
 constexpr long max_iterations = 10000;
-constexpr double direction_tolerance = 1e-12;  // below it a direction of rows of about unit norm counts as zero
+constexpr double direction_tolerance = 1e-12;  // shorter combinations of rows, whose norms are about one, are zero
 
 namespace {
 
@@ -25,23 +25,22 @@ double residual(const Matrix& A, In b, In lower, In upper, const Vector& x) {
   return (x - (x - gradient).cwiseMax(lower).cwiseMin(upper)).lpNorm<Eigen::Infinity>();
 }
 
-// Solve for the variables that are not at their bounds once more, to rounding. Tries the minimum-norm solution, then
-// the one closest to x.
+// Improve x to rounding: solve again for the variables that are not at their bounds. If A is singular, the minimum-norm
+// solution is tried first, then the one closest to x.
 void refine(const Matrix& A, In b, In lower, In upper, Vector& x) {
   const double tolerance = bound_tolerance * std::max(1.0, x.lpNorm<Eigen::Infinity>());
-  Indices off_bounds;
+  Indices free;
   Vector bound = x;
   for (Eigen::Index i = 0; i < x.size(); ++i)
-    if (x(i) - lower(i) > tolerance && upper(i) - x(i) > tolerance)
-      off_bounds.push_back(static_cast<int>(i)), bound(i) = 0.0;
-  if (off_bounds.empty()) return;
-  Eigen::CompleteOrthogonalDecomposition<Matrix> factors;
-  factors.setThreshold(direction_tolerance);
-  factors.compute(A(off_bounds, off_bounds));
+    if (x(i) - lower(i) > tolerance && upper(i) - x(i) > tolerance) free.push_back(static_cast<int>(i)), bound(i) = 0.0;
+  if (free.empty()) return;
+  Eigen::CompleteOrthogonalDecomposition<Matrix> factorization;
+  factorization.setThreshold(direction_tolerance);
+  factorization.compute(A(free, free));
   for (const Vector& start : {bound, x}) {
     const Vector gradient = A * start + b;
     Vector refined = start;
-    refined(off_bounds) -= factors.solve(gradient(off_bounds));
+    refined(free) -= factorization.solve(gradient(free));
     refined = refined.cwiseMax(lower).cwiseMin(upper);
     if (residual(A, b, lower, upper, refined) <= std::max(residual(A, b, lower, upper, x), solver_tolerance)) {
       x = refined;
@@ -74,16 +73,16 @@ bool minimize_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
 
 // A linear program in (x, s), solved with an active-set method from the feasible point x = 0. Follow the null space
 // of the working set while s grows, then drop the first row with a negative multiplier (Bland's rule).
-double maximize_slack(const Matrix& N, In y, In lower, In upper) {
+double maximize_bound_distance(const Matrix& N, In y, In lower, In upper) {
   constexpr double infinity = std::numeric_limits<double>::infinity();
   const Eigen::Index m = N.rows(), size = N.cols() + 1;
   Matrix rows(2 * m, size);  // rows (x, s) <= limits
   Vector limits(2 * m);
   Eigen::Index count = 0;
-  const auto add_limit = [&](Eigen::Index i, double side, double room) {
-    if (!std::isfinite(room)) return;
+  const auto add_limit = [&](Eigen::Index i, double side, double distance) {
+    if (!std::isfinite(distance)) return;
     rows.row(count) << side * N.row(i), 1.0;
-    limits(count) = room;
+    limits(count) = distance;
     ++count;
   };
   for (Eigen::Index i = 0; i < m; ++i) add_limit(i, 1.0, upper(i) - y(i)), add_limit(i, -1.0, y(i) - lower(i));
@@ -116,8 +115,8 @@ double maximize_slack(const Matrix& N, In y, In lower, In upper) {
     for (Eigen::Index i = 0; i < count; ++i) {
       const double rate = rows.row(i).dot(direction);
       if (!(rate > direction_tolerance) || std::find(working.begin(), working.end(), i) != working.end()) continue;
-      const double room = std::max(limits(i) - rows.row(i).dot(point), 0.0) / rate;
-      if (room < step) step = room, blocking = i;
+      const double step_to_limit = std::max(limits(i) - rows.row(i).dot(point), 0.0) / rate;
+      if (step_to_limit < step) step = step_to_limit, blocking = i;
     }
     if (blocking < 0) return infinity;
     point += step * direction;

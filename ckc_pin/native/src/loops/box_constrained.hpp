@@ -1,4 +1,4 @@
-// Small convex programs with box constraints.
+// Small convex programs with box constraints: a quadratic and a linear one.
 #pragma once
 
 #include "tree/types.hpp"
@@ -11,6 +11,6 @@ bool minimize_in_box(const Matrix& A, In b, In lower, In upper, Vector& x);
 
 // Return the largest s for which some x satisfies lower + s <= y + N x <= upper - s. It is negative if y + N x cannot
 // be within its bounds, and infinite if there are no bounds.
-double maximize_slack(const Matrix& N, In y, In lower, In upper);
+double maximize_bound_distance(const Matrix& N, In y, In lower, In upper);
 
 }  // namespace ckc

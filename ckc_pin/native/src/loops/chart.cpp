@@ -8,7 +8,7 @@
 
 namespace ckc {
 
-constexpr double max_rotation_from_reference = 1.0;  // rad; rotation vectors are singular at 2 pi
+constexpr double max_rotation_from_reference = 1.0;  // rad; the chart is singular at 2 pi
 
 static Vector3 triple(In x, const int* at) { return {x(at[0]), x(at[1]), x(at[2])}; }
 
@@ -28,24 +28,24 @@ void Chart::reset(const Core& core, In q_tree) {
   }
 }
 
-void Chart::numbers(const Core& core, In q_tree, Out numbers) const {
-  for (int k = 0; k < core.d; ++k) numbers(k) = q_tree(core.tree.q_index[core.q[k]]);
+void Chart::coordinates(const Core& core, In q_tree, Out coordinates) const {
+  for (int k = 0; k < core.d; ++k) coordinates(k) = q_tree(core.tree.q_index[core.q[k]]);
   for (const Root& root : roots_) {
-    put_triple(q_tree.segment<3>(root.at.q), root.k, numbers);
-    put_triple(log3(root.reference.transpose() * core.tree.orientation(q_tree, root.at)), root.k + 3, numbers);
+    put_triple(q_tree.segment<3>(root.at.q), root.k, coordinates);
+    put_triple(log3(root.reference.transpose() * core.tree.orientation(q_tree, root.at)), root.k + 3, coordinates);
   }
 }
 
-void Chart::tangent_step(const Core& core, In q_tree, In numbers, Out step) const {
-  for (int k = 0; k < core.d; ++k) step(k) = numbers(k) - q_tree(core.tree.q_index[core.q[k]]);
+void Chart::tangent_step(const Core& core, In q_tree, In coordinates, Out step) const {
+  for (int k = 0; k < core.d; ++k) step(k) = coordinates(k) - q_tree(core.tree.q_index[core.q[k]]);
   for (const Root& root : roots_) {
-    const Vector6 twist = core.tree.twist_to(q_tree, root.at, root.reference * exp3(triple(numbers, root.k + 3)),
-                                             triple(numbers, root.k));
+    const Vector6 twist = core.tree.twist_to(q_tree, root.at, root.reference * exp3(triple(coordinates, root.k + 3)),
+                                             triple(coordinates, root.k));
     put_triple(twist.head<3>(), root.k, step), put_triple(twist.tail<3>(), root.k + 3, step);
   }
 }
 
-void Chart::numbers_rate(const Core& core, In q_tree, In q_dot, Out rate) const {
+void Chart::coordinate_rates(const Core& core, In q_tree, In q_dot, Out rate) const {
   rate = q_dot;
   for (const Root& root : roots_) {
     const Matrix3 orientation = core.tree.orientation(q_tree, root.at);
@@ -56,8 +56,8 @@ void Chart::numbers_rate(const Core& core, In q_tree, In q_dot, Out rate) const 
 
 void Chart::transform_jacobian(const Core& core, In q_tree, In q_dot, Matrix& jacobian) const {
   const int d = core.d;
-  // numbers_dot = rates q_dot, and how that changes along q
-  Matrix rates = Matrix::Identity(d, d), changes = Matrix::Zero(d, d);
+  // coordinates_dot = rates q_dot; rate_by_q: its derivative with respect to tangent steps of q
+  Matrix rates = Matrix::Identity(d, d), rate_by_q = Matrix::Zero(d, d);
   for (const Root& root : roots_) {
     const Matrix3 orientation = core.tree.orientation(q_tree, root.at);
     const LogJacobian log(log3(root.reference.transpose() * orientation));
@@ -67,19 +67,19 @@ void Chart::transform_jacobian(const Core& core, In q_tree, In q_dot, Matrix& ja
       rates.col(root.k[i]).setZero(), rates.col(root.k[3 + i]).setZero();
       put_triple(orientation * axis, root.k, rates.col(root.k[i])),
           put_triple(column, root.k + 3, rates.col(root.k[3 + i]));
-      put_triple(orientation * axis.cross(translation), root.k, changes.col(root.k[3 + i]));
-      put_triple(log.derivative(column) * rotation_rate, root.k + 3, changes.col(root.k[3 + i]));
+      put_triple(orientation * axis.cross(translation), root.k, rate_by_q.col(root.k[3 + i]));
+      put_triple(log.derivative(column) * rotation_rate, root.k + 3, rate_by_q.col(root.k[3 + i]));
     }
   }
-  const Matrix steps = rates.inverse();  // tangent step per change of the numbers
-  jacobian.topLeftCorner(d, d) = changes * steps;
+  const Matrix steps = rates.inverse();  // tangent step per change of the coordinates
+  jacobian.topLeftCorner(d, d) = rate_by_q * steps;
   jacobian.topRightCorner(d, d) = rates;
   jacobian.bottomLeftCorner(d, d) = Matrix(jacobian.bottomLeftCorner(d, d) * steps);
 }
 
-bool Chart::needs_new_reference(In numbers) const {
+bool Chart::needs_new_reference(In coordinates) const {
   return std::any_of(roots_.begin(), roots_.end(), [&](const Root& root) {
-    return triple(numbers, root.k + 3).norm() > max_rotation_from_reference;
+    return triple(coordinates, root.k + 3).norm() > max_rotation_from_reference;
   });
 }
 

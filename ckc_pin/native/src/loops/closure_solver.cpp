@@ -4,9 +4,9 @@
 
 namespace ckc {
 
-// The same as in `ckc_pin.kinematics.sigma`.
-constexpr double max_newton_step = 0.5;  // rad, or relative to the mechanism's size; longer steps are not local
-constexpr double min_fraction = 1e-9;
+// As in `ckc_pin.kinematics.sigma`.
+constexpr double max_newton_step = 0.5;  // rad, or relative to the mechanism's size; longer steps may change the branch
+constexpr double min_fraction = 1e-9;    // of the way to q, in one continuation step
 constexpr int max_iterations = 12;
 constexpr double min_contraction = 0.1;  // continue to rounding while a step reduces the residual by this factor
 
@@ -64,15 +64,15 @@ bool ClosureSolver::continue_to(In q, double tolerance) {
   return fraction == 1.0 && !core_.phi_z.singular();
 }
 
-// Redundant rows may contradict each other slightly, so measure only what z can correct.
+// Redundant rows may contradict each other slightly. Measure only the part of the residual that z can correct.
 double ClosureSolver::residual_size() {
   if (!residual_.allFinite()) return std::nan("");
-  const auto dependent_row_tolerance = static_cast<Eigen::Index>(core_.z.size());
-  if (residual_.size() > dependent_row_tolerance && !core_.phi_z.singular()) {
-    z_.resize(dependent_row_tolerance);
+  const auto z_count = static_cast<Eigen::Index>(core_.z.size());
+  if (residual_.size() > z_count && !core_.phi_z.singular()) {
+    z_.resize(z_count);
     core_.solve_z(residual_, z_);
     residual_.setZero();
-    for (Eigen::Index k = 0; k < dependent_row_tolerance; ++k) residual_ += z_(k) * core_.constraints.J.col(core_.z[k]);
+    for (Eigen::Index k = 0; k < z_count; ++k) residual_ += z_(k) * core_.constraints.J.col(core_.z[k]);
   }
   return residual_.size() ? residual_.lpNorm<Eigen::Infinity>() : 0.0;
 }

@@ -1,5 +1,5 @@
-// Projection onto the constraint manifold by Newton's method on z, and continuation along q. It does the same as
-// `sigma` of the readable Python reference, but does not say why it fails.
+// Projection onto the constraint manifold by Newton's method on z, and continuation along q. The algorithm is that of
+// `ckc_pin.kinematics.sigma`, which also explains failures.
 #pragma once
 
 #include "loops/core.hpp"
@@ -19,7 +19,8 @@ class ClosureSolver {
   bool continue_to(In q, double tolerance);
 
   long newton_steps = 0;
-  // Newton steps after which D' is likely needed, and which the last projection took; negative: D' is not needed
+  // Newton steps of the last projection. D' is evaluated together with the configuration after as many steps, because
+  // that one is likely to be the last. Negative: never.
   int expected_steps = -1;
 
  private:

@@ -11,9 +11,9 @@ CompiledTerms::CompiledTerms(const std::string& path, In parameters)
     : library_(dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL)) {
   if (!library_) throw std::runtime_error(dlerror());
   try {
-    parameter_count_ = sparsity_size("numbers_sparsity_in");
+    parameter_count_ = row_count("numbers_sparsity_in");
     if (parameter_count_ != parameters.size()) throw std::runtime_error(path + ": of another mechanism");
-    constants_.setZero(sparsity_size("numbers_sparsity_out"));
+    constants_.setZero(row_count("numbers_sparsity_out"));
     constants_code_ = find_code("numbers", 1);
     set_parameters(parameters);
     closure_code_ = find_code("place", 3), inertia_code_ = find_code("inertia", 3), bias_code_ = find_code("bias", 4);
@@ -21,16 +21,16 @@ CompiledTerms::CompiledTerms(const std::string& path, In parameters)
     coriolis_code_ = find_optional_code("coriolis", 5);
     potential_energy_code_ = find_code("potential_energy", 3), acceleration_code_ = find_code("acceleration", 6);
     closure_step_code_ = find_code("closing_step", 4), jacobian_code_ = find_optional_code("jacobian", 5);
-    state_code_ = find_optional_code("state", 5), change_code_ = find_optional_code("change", 2),
-    changes_code_ = find_optional_code("changes", 2);
+    state_code_ = find_optional_code("state", 5), derivative_code_ = find_optional_code("change", 2),
+    derivatives_code_ = find_optional_code("changes", 2);
     groups_code_ = find_optional_code("groups", 1);
     if (state_code_) {
-      state_data_.resize(sparsity_size("state_sparsity_out") / 8 + 1),
-          acceleration_at_.setZero(sparsity_size("state_sparsity_out", 1));
-      if (changes_code_)
-        lanes_ = static_cast<int>(sparsity_size("changes_sparsity_out") / sparsity_size("change_sparsity_out"));
-      direction_size_ = static_cast<int>(sparsity_size("change_sparsity_in", 1));
-      for (long long k = 0; k < sparsity_size("groups_sparsity_out"); ++k)
+      state_data_.resize(row_count("state_sparsity_out") / 8 + 1),
+          state_acceleration_.setZero(row_count("state_sparsity_out", 1));
+      if (derivatives_code_)
+        lanes_ = static_cast<int>(row_count("changes_sparsity_out") / row_count("change_sparsity_out"));
+      direction_size_ = static_cast<int>(row_count("change_sparsity_in", 1));
+      for (long long k = 0; k < row_count("groups_sparsity_out"); ++k)
         parameter_codes_.push_back(find_code(("varied_" + std::to_string(k)).c_str(), 2));
     }
   } catch (...) {
@@ -49,9 +49,9 @@ void CompiledTerms::set_parameters(In parameters) {
 CompiledTerms::~CompiledTerms() { dlclose(library_); }
 
 void* CompiledTerms::find_symbol(const std::string& name) const {
-  void* found = dlsym(library_, name.c_str());
-  if (!found) throw std::runtime_error("no function " + name + " in the library of a mechanism's terms");
-  return found;
+  void* symbol = dlsym(library_, name.c_str());
+  if (!symbol) throw std::runtime_error("no function " + name + " in the library of a mechanism's terms");
+  return symbol;
 }
 
 CompiledTerms::Code CompiledTerms::find_code(const char* name, int arguments) const {
@@ -64,8 +64,8 @@ CompiledTerms::Code CompiledTerms::find_optional_code(const char* name, int argu
   return dlsym(library_, name) ? find_code(name, arguments) : nullptr;
 }
 
-long long CompiledTerms::sparsity_size(const char* of, long long k) const {
-  return reinterpret_cast<const long long* (*)(long long)>(find_symbol(of))(k)[0];
+long long CompiledTerms::row_count(const char* sparsity, long long k) const {
+  return reinterpret_cast<const long long* (*)(long long)>(find_symbol(sparsity))(k)[0];
 }
 
 void CompiledTerms::evaluate_closure(In q, Out phi, Matrix& J) const {
@@ -112,20 +112,21 @@ double CompiledTerms::potential_energy(In q) const {
   return value;
 }
 
-static bool same(In a, const Vector& b) {
+static bool is_identical(In a, const Vector& b) {
   return a.size() == b.size() && std::memcmp(a.data(), b.data(), sizeof(double) * static_cast<size_t>(a.size())) == 0;
 }
 
 bool CompiledTerms::prepare_derivatives(In q, In v, In u_tree) const {
   if (!elimination_allowed_) return false;
-  return q_.size() && same(q, q_) && same(v, v_) && same(u_tree, u_) ? is_sound_ : compute_state(q, v, u_tree);
+  const bool is_current = q_.size() && is_identical(q, q_) && is_identical(v, v_) && is_identical(u_tree, u_);
+  return is_current ? is_sound_ : compute_state(q, v, u_tree);
 }
 
 bool CompiledTerms::compute_state(In q, In v, In u_tree) const {
   q_ = q, v_ = v, u_ = u_tree;
   double is_sound = 0.0;
   const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()};
-  double* to[] = {state_data_.data()->x, acceleration_at_.data(), &is_sound};
+  double* to[] = {state_data_.data()->x, state_acceleration_.data(), &is_sound};
   state_code_(from, to, nullptr, nullptr, 0);
   return is_sound_ = is_sound > 0.0;
 }
@@ -133,24 +134,24 @@ bool CompiledTerms::compute_state(In q, In v, In u_tree) const {
 void CompiledTerms::directional_derivative(In direction, Out acceleration) const {
   const double* from[] = {state_data_.data()->x, direction.data()};
   double* to[] = {acceleration.data()};
-  change_code_(from, to, nullptr, nullptr, 0);
+  derivative_code_(from, to, nullptr, nullptr, 0);
 }
 
 void CompiledTerms::directional_derivatives(const Matrix& directions, Matrix& acceleration) const {
   const double* from[] = {state_data_.data()->x, directions.data()};
   double* to[] = {acceleration.data()};
-  changes_code_(from, to, nullptr, nullptr, 0);
+  derivatives_code_(from, to, nullptr, nullptr, 0);
 }
 
 Indices CompiledTerms::parameter_groups(In direction) const {
-  Vector changed(parameter_codes_.size());
+  Vector is_involved(parameter_codes_.size());
   const double* from[] = {direction.data()};
-  double* to[] = {changed.data()};
+  double* to[] = {is_involved.data()};
   groups_code_(from, to, nullptr, nullptr, 0);
-  Indices found;
-  for (Eigen::Index k = 0; k < changed.size(); ++k)
-    if (changed(k) != 0.0) found.push_back(static_cast<int>(k));
-  return found;
+  Indices groups;
+  for (Eigen::Index k = 0; k < is_involved.size(); ++k)
+    if (is_involved(k) != 0.0) groups.push_back(static_cast<int>(k));
+  return groups;
 }
 
 void CompiledTerms::parameter_direction(int group, In direction, Out added) const {
@@ -160,10 +161,10 @@ void CompiledTerms::parameter_direction(int group, In direction, Out added) cons
 }
 
 bool CompiledTerms::eliminate(In q, In v, In u_tree, In correction, Out acceleration) const {
-  // The function for derivatives computes the acceleration too; the derivatives cost little more.
+  // The function that prepares derivatives computes the acceleration too, at little extra cost.
   if (state_code_ && correction.isZero(0)) {
     if (!compute_state(q, v, u_tree)) return false;
-    acceleration = acceleration_at_;
+    acceleration = state_acceleration_;
     return true;
   }
   double is_sound = 0.0;
@@ -184,8 +185,8 @@ bool CompiledTerms::closure_step(In q, In residual, Out x) const {
 
 bool CompiledTerms::evaluate_jacobian(In q, In v, In u_tree, Matrix& by_state, Matrix& by_u) const {
   if (!jacobian_code_ || !elimination_allowed_) return false;
-  const auto sparsity_size = q.size() + v.size();
-  by_state.resize(sparsity_size, sparsity_size), by_u.resize(v.size(), v.size());
+  const auto state_size = q.size() + v.size();
+  by_state.resize(state_size, state_size), by_u.resize(v.size(), v.size());
   double is_sound = 0.0;
   const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()};
   double* to[] = {by_state.data(), by_u.data(), &is_sound};

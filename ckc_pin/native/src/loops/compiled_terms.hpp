@@ -36,9 +36,10 @@ class CompiledTerms {
     return elimination_allowed_ && eliminate(q, v, u_tree, correction, acceleration);
   }
   bool eliminate(In q, In v, In u_tree, In correction, Out acceleration) const;
-  // Directional derivatives of the acceleration, if the library has them. `prepare_derivatives` fixes the state;
-  // false as above. A direction is (step of q', change of v', `added`), where `added` are changes of u' and of J
-  // v'_dot in the rows that are kept. `directional_derivatives` takes `lanes` directions at a time, one per row.
+  // Directional derivatives of the acceleration, if the library has them, at the state of `prepare_derivatives`, which
+  // returns false as above. A direction is (derivative of q', of v', `added`), where `added` are the derivatives of u'
+  // and of J v'_dot in the rows that the elimination uses. `directional_derivatives` takes `lanes` directions at a
+  // time, one per row.
   bool has_directional_derivatives() const { return state_code_; }
   int lanes() const { return lanes_; }
   int direction_size() const { return direction_size_; }
@@ -46,7 +47,7 @@ class CompiledTerms {
   void directional_derivative(In direction, Out acceleration) const;
   // (lanes, direction_size) -> (lanes, n)
   void directional_derivatives(const Matrix& directions, Matrix& acceleration) const;
-  // Groups of parameters that a parameter direction involves, and what one of the groups contributes to `added`.
+  // Groups of parameters that a parameter direction involves, and the contribution of one group to `added`.
   Indices parameter_groups(In direction) const;
   void parameter_direction(int group, In direction, Out added) const;
   // Step x with J x = -residual, minimum-norm in the metric of D'. False as above.
@@ -60,27 +61,29 @@ class CompiledTerms {
   void* find_symbol(const std::string& name) const;
   Code find_code(const char* name, int arguments) const;           // checks the number of arguments
   Code find_optional_code(const char* name, int arguments) const;  // null if the library has none
-  long long sparsity_size(const char* of, long long k = 0) const;
-  bool compute_state(In q, In v, In u_tree) const;  // evaluates at another state than the last one
+  // Rows of argument or result k, from a function's table of sparsity patterns.
+  long long row_count(const char* sparsity, long long k = 0) const;
+  bool compute_state(In q, In v, In u_tree) const;  // evaluates the intermediate results of derivatives
 
   // Cosines and sines of q, which most functions of one state share.
   const double* trig(In q) const { return trig_.cosines_and_sines(q); }
 
   void* library_;
   long long parameter_count_ = 0;  // stored because looking it up takes longer than a call
-  Vector constants_;               // the parameters and everything that depends on them alone
+  Vector constants_;               // the parameters and the expressions that depend on nothing else
   mutable Trig trig_;
-  struct alignas(64) Line {  // one cache line, so that four numbers that are read at once are in one line
+  struct alignas(64) Line {  // one cache line: numbers that a vector load reads together are in one line
     double x[8];
   };
-  mutable Vector q_, v_, u_, acceleration_at_;  // the last state of `prepare_derivatives`
-  mutable std::vector<Line> state_data_;        // and its intermediate results
+  // The last state of `prepare_derivatives`, its acceleration, intermediate results, and whether no pivot was needed.
+  mutable Vector q_, v_, u_, state_acceleration_;
+  mutable std::vector<Line> state_data_;
   mutable bool is_sound_ = false;
   bool elimination_allowed_ = true;
   int lanes_ = 1, direction_size_ = 0;
   Code constants_code_, closure_code_, inertia_code_, bias_code_, J_dot_code_, h_tree_code_, coriolis_code_,
       potential_energy_code_, acceleration_code_, closure_step_code_, jacobian_code_;
-  Code state_code_, change_code_, changes_code_, groups_code_;
+  Code state_code_, derivative_code_, derivatives_code_, groups_code_;
   std::vector<Code> parameter_codes_;
 };
 

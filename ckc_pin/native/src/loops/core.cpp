@@ -8,8 +8,10 @@
 
 namespace ckc {
 
-constexpr int max_small_size = 12;       // in coordinates
-constexpr double min_dense_share = 0.2;  // nonzero share of D' from which dense products are faster
+// Products with D' are computed densely if D' has more coordinates than the first constant, and a larger share of
+// nonzero entries than the second.
+constexpr int max_sparse_size = 12;
+constexpr double min_dense_share = 0.2;
 
 Core::Core(CoreTable table)
     : tree(table.model, std::move(table.q_index)),
@@ -28,13 +30,13 @@ Core::Core(CoreTable table)
       J_dot_v.setZero(m);
   C_tree_.setZero(n, n), damping_tree.setZero(n), D_compiled_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
-  lacking_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
+  unbalanced_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
   tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
-  tangent_matrix_.setZero(n - rank, n - rank), tangent_factor_.shape(n - rank);
+  tangent_matrix_.setZero(n - rank, n - rank), tangent_factor_.resize(n - rank);
   rho_times_x_.setZero(n), tangent_solution_.setZero(n - rank), tangent_rhs_.setZero(n - rank);
   size_t entries = 0;
   for (const Indices& above : tree.ancestors) entries += 2 * above.size();
-  D_tree_is_dense_ = n > max_small_size && static_cast<double>(entries) > min_dense_share * n * n;
+  D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
 }
 
 Core::~Core() = default;
@@ -44,15 +46,15 @@ void Core::set_partition(Indices q_, Indices z_) {
   d = static_cast<int>(q.size());
   const int m = constraints.closure.rows, k = static_cast<int>(z.size());
   const auto pattern = constraints.pattern_in(z, n);
-  phi_z.shape(m, k, pattern), basis_.shape(m, k, pattern);
+  phi_z.set_pattern(m, k, pattern), basis_.set_pattern(m, k, pattern);
   basis_q_ = q, basis_z_ = z, basis_configuration_ = -1;
-  D_factor.shape(d);
+  D_factor.resize(d);
   rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
 
-Eigen::Index Core::parameter_size(Parameter what) const {
+Eigen::Index Core::parameter_size(Parameter parameter) const {
   const Eigen::Index m = constraints.closure.rows;
-  switch (what) {
+  switch (parameter) {
     case Parameter::gravity: return 3;
     case Parameter::offset:
     case Parameter::centre: return 3 * tree.joints;
@@ -71,17 +73,17 @@ Eigen::Index Core::parameter_size(Parameter what) const {
   }
 }
 
-void Core::set_parameters(Parameter what, In numbers) {
-  const int k = static_cast<int>(what);
-  const auto from = [k](Parameter first) { return k - static_cast<int>(first); };
-  if (what == Parameter::compiled)
-    compiled->set_parameters(numbers);
-  else if (what >= Parameter::end)
-    springs.set_parameters(static_cast<Springs::Parameter>(from(Parameter::end)), numbers);
-  else if (what >= Parameter::point)
-    constraints.set_parameters(static_cast<ConstraintRows::Parameter>(from(Parameter::point)), numbers);
+void Core::set_parameters(Parameter parameter, In values) {
+  const int k = static_cast<int>(parameter);
+  const auto offset_from = [k](Parameter first) { return k - static_cast<int>(first); };
+  if (parameter == Parameter::compiled)
+    compiled->set_parameters(values);
+  else if (parameter >= Parameter::end)
+    springs.set_parameters(static_cast<Springs::Parameter>(offset_from(Parameter::end)), values);
+  else if (parameter >= Parameter::point)
+    constraints.set_parameters(static_cast<ConstraintRows::Parameter>(offset_from(Parameter::point)), values);
   else
-    tree.set_parameters(static_cast<Tree::Parameter>(k), numbers);
+    tree.set_parameters(static_cast<Tree::Parameter>(k), values);
   valid_parts_ = 0, basis_configuration_ = -1, ++configuration_count;
 }
 
@@ -116,7 +118,7 @@ void Core::set_velocity(In v) {
   valid_parts_ &= ~(row_rates | bias_of_tree | coriolis_of_tree);
 }
 
-// Compute what the compiled terms do not provide.
+// Evaluate Pinocchio's tree, for quantities that the compiled terms do not provide.
 void Core::update_tree() {
   if (is_valid(tree_is_set)) return;
   tree.set_configuration(q_tree);

@@ -18,7 +18,7 @@ namespace ckc {
 class CompiledTerms;
 
 struct Energy {
-  double kinetic, potential;  // of gravity and springs, J
+  double kinetic, potential;  // J; potential: of gravity, springs and constant forces
   double total() const { return kinetic + potential; }
 };
 
@@ -27,7 +27,7 @@ struct Scales {
   double rank;           // relative size below which a pivot of the scaled J counts as zero
 };
 
-// What a Core is built from.
+// The data of which a Core is built.
 struct CoreTable {
   std::string model;  // in Pinocchio's binary format
   Indices q_index;    // for each tangent coordinate, its index in q'
@@ -59,8 +59,8 @@ class Core {
 
   void set_partition(Indices q, Indices z);  // partition q' = [q; z]
 
-  // Replace one kind of parameter, as `ckc_pin.codegen.arguments` lists them; `compiled` are the parameters of the
-  // compiled terms. All computed terms become invalid.
+  // Kinds of parameters, in the order of Tree::Parameter, ConstraintRows::Parameter and Springs::Parameter. `compiled`:
+  // all parameters of the compiled terms, as `ckc_pin.codegen.arguments` lists them.
   enum class Parameter {
     gravity,
     offset,
@@ -82,8 +82,9 @@ class Core {
     constant,
     compiled,
   };
-  Eigen::Index parameter_size(Parameter what) const;
-  void set_parameters(Parameter what, In numbers);
+  Eigen::Index parameter_size(Parameter parameter) const;
+  // Replace one kind of parameter. All computed terms become invalid.
+  void set_parameters(Parameter parameter, In values);
   // Whether det phi_z < 0 at this configuration; false if phi_z is not square.
   bool has_negative_determinant();
 
@@ -99,15 +100,16 @@ class Core {
   std::unique_ptr<CompiledTerms> compiled;  // terms of the tree and the constraint rows; null: Pinocchio's
 
   // --- terms that depend on q' ---
-  void set_configuration(In q_tree, bool with_inertia = false);  // phi and placements; D' in the same sweep
+  // Compute phi and the placements. `with_inertia`: also D', in the same sweep through the tree.
+  void set_configuration(In q_tree, bool with_inertia = false);
   double tolerance_scale() const { return tree.tolerance_scale(q_tree, scales.columns); }
-  // incremented by `set_configuration`: tells whether the core has moved since it was last used
+  // Incremented by `set_configuration`. A caller that remembers it can tell whether the core has moved.
   long configuration_count = 0;
   void compute_J();
   void factorize_phi_z();
   void compute_rho();  // eq. 5
   void compute_D_tree();
-  void compute_D();  // and its factorization
+  void compute_D();  // and factorize it
   Vector q_tree;
   Factor phi_z;
   DefiniteFactor D_factor;
@@ -115,18 +117,18 @@ class Core {
   void solve_z(In b, Out x) { phi_z.solve(b, x); }
   void closure_step_in_z(In residual, Out x);     // step x of z alone with J x = -residual; requires phi_z
   void multiply_D_tree(In x, Out product) const;  // D' x
-  double joint_inertia(int k) const { return D_tree()(k, k); }  // inertia of one coordinate if there were no loops
+  double joint_inertia(int k) const { return D_tree()(k, k); }  // inertia of a coordinate without the loops
   double potential_energy();
   Energy energy(In v, Out momentum);
 
   // --- terms that depend on v' ---
-  void set_velocity(In v_tree);                              // velocity of the following terms
+  void set_velocity(In v_tree);                              // at which the following terms are evaluated
   void compute_bias();                                       // C'v + h' without springs, J_dot v
   void compute_coriolis();                                   // C', J_dot, and h' without springs
   void compute_J_dot(In v_tree);                             // constraints.J_dot only
   void constraint_rate_derivative(In v_tree, Matrix& by_q);  // d (J v') / d q', tangent
   Vector v_tree, bias_tree, h_tree, J_dot_v;
-  Vector damping_tree;                                            // forces of dampers
+  Vector damping_tree;                                            // forces of the dampers
   void multiply_rho(In q_dot, Out v) const;                       // rho q_dot
   void multiply_rho_transposed(In force, Out generalized) const;  // rho^T force
   void multiply_C_tree(In x, Out product);                        // C' x; requires compute_coriolis
@@ -141,12 +143,12 @@ class Core {
   void spf_z_dot(In q_dot, double epsilon, In w, Out z_dot);
   // Acceleration of the tree; requires `reduced_acceleration`.
   void tree_acceleration(In q_ddot, Out a) const;
-  // Step x with J x = -residual, minimum-norm in the metric of D' (near a loss of rank, in that of the coordinates).
-  // False if J has lost rank.
+  // Step x with J x = -residual, minimum-norm in the metric of D' (near a loss of rank, in the Euclidean metric of the
+  // scaled coordinates). False if J has lost rank.
   bool closure_step(In residual, Out x);
-  // The same in the metric of the coordinates, along all directions that J determines.
+  // The same in the Euclidean metric, along all directions that J determines.
   bool minimum_norm_closure_step(In residual, Out x);
-  // One of the two, whichever is cheaper. Used as a step of an iteration that projects onto the constraint manifold.
+  // One of the two, whichever is cheaper: a step of an iteration that projects onto the constraint manifold.
   bool cheapest_closure_step(In residual, Out x);
   // Basis of the velocities that the loops allow, (n, n - rank); null if J has lost rank. Each column belongs to one
   // of `basis_coordinates`.
@@ -159,7 +161,7 @@ class Core {
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
   // Relative rounding errors of the acceleration at the core's state: of compiled elimination compared with
   // projection (even if elimination is not allowed), and of projection compared with projection by mass levels. Zero
-  // if one of the two does not exist.
+  // if the reference does not exist.
   double rounding_of_elimination(In u_tree);
   double rounding_of_projection(In u_tree);
   // Whether masses differ so much that projection may lose digits. With `use_mass_levels`, projection by mass levels
@@ -176,7 +178,7 @@ class Core {
   void acceleration_rounding(const Indices& at, const Matrix& columns, In force, In a, Vector& bound);
   // Distance of the holding forces from their bounds; requires `acceleration_with_held_joints`.
   double holding_margin() { return joints.holding_margin(rounding_); }
-  // of the locked joints
+  // Requires `acceleration_with_held_joints`.
   Indices find_joints_at_force_limit() const { return joints.find_joints_at_force_limit(rounding_); }
   // Compute `derivatives` at the core's state, where the tree has this acceleration under u'. False if a number is
   // not finite.
@@ -186,10 +188,10 @@ class Core {
   void minimum_norm_multipliers(In force, Out lambda);
   // Solve for derivatives of the acceleration: for each column, D' a = force + J^T lambda and J a = -residual. False
   // if J has lost rank.
-  bool solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& change);
-  // Derivatives of eq. 1's acceleration. Forces of joints are added to `force` first. `by_u` is computed if `with_u`.
-  // With compiled terms and no locked joint, the state may differ from the core's, and the acceleration itself is not
-  // computed. False if J has lost rank.
+  bool solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& derivatives);
+  // Derivatives of eq. 1's acceleration, with friction and holding forces, which are added to `force`. `with_u`: by_u
+  // too. With compiled terms and no locked joint, the state may differ from the core's, and the acceleration itself is
+  // not computed. False if J has lost rank.
   bool acceleration_derivatives(In q_tree, In v, In correction, AppliedForce& force, AccelerationDerivatives& result,
                                 bool with_u = false);
   // `dae_acceleration` by compiled elimination, at any state. False if there is none or it would need a pivot.
@@ -217,12 +219,12 @@ class Core {
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
-  struct Components;                         // of the velocities of bodies
+  struct Components;                         // velocity components of the bodies
   void body_velocity_components(Components& of);
-  bool find_basis_for_check();                      // by pivoting; the basis is not reused
+  bool find_basis_for_check();                      // by pivoting; the basis is not used later
   void project_on_tangent_space(In u_tree, Out a);  // eq. 1, requires tangent_ and x_
   bool project_by_mass_levels(In u_tree, Out a);    // the same; false if some motion moves no mass
-  double relative_difference(In a, In right);       // requires project_on_tangent_space
+  double relative_difference(In a, In reference);   // requires project_on_tangent_space
   bool find_basis_by_partition();
   bool find_basis_by_pivoting(double min_pivot);
   double largest_basis_entry() const;
@@ -230,21 +232,21 @@ class Core {
 
   bool D_tree_is_dense_;
   bool uses_mass_levels_ = false;
-  unsigned valid_parts_ = 0;  // bit set of the parts that are valid for q_tree and v_tree
+  unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
   Matrix C_tree_, D_compiled_, D_rho_, tangent_, D_tangent_;
-  Indices basis_coordinates_;           // coordinates that the columns of the tangent basis belong to
+  Indices basis_coordinates_;           // by column of the tangent basis: its coordinate
   Indices basis_q_, basis_z_, pivots_;  // partition of the tangent basis; independent of q and z
   Factor basis_;
-  // `configuration_count` at which tangent_ and basis_ were computed for that partition, else -1
-  long basis_configuration_ = -1;
+  // Values of `configuration_count` at which tangent_ and basis_ were computed by that partition, and at which
+  // tangent_factor_ was computed for it; -1 if they are not valid.
+  long basis_configuration_ = -1, inertia_configuration_ = -1;
   Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
-  long inertia_configuration_ = -1;  // the same for tangent_factor_
   Eigen::ColPivHouseholderQR<Matrix> qr_;
   Eigen::CompleteOrthogonalDecomposition<Matrix> transposed_;
-  Matrix tangent_matrix_, by_state_, change_, responses_;
+  Matrix tangent_matrix_, by_state_, force_derivative_, responses_;
   DefiniteFactor tangent_factor_;
   Vector rounding_, force_bound_;
-  Vector householder_rhs_, minus_residual_, rho_times_x_, tangent_solution_, tangent_rhs_, lacking_force_, lambda_;
+  Vector householder_rhs_, minus_residual_, rho_times_x_, tangent_solution_, tangent_rhs_, unbalanced_force_, lambda_;
 };
 
 }  // namespace ckc

@@ -1,10 +1,10 @@
 // Acceleration of eq. 1 for mechanisms with very unequal masses.
 //
-// T^T D' T adds the contributions of heavy and light bodies for each pair of directions. Directions that move light
-// bodies only are then known to the rounding of the heavy ones: to seven digits if masses differ by 1e9 and a heavy
-// load is at the end of a chain. Here the directions are sorted into levels. Directions of the first level move the
-// heaviest bodies, all others leave these at rest, and so on. Only bodies that both directions of a pair move then
-// contribute to its entry of D'.
+// T^T D' T adds the contributions of heavy and light bodies for each pair of tangent directions. The entries of
+// directions that move light bodies only are then as inexact as the rounding of the heavy ones: seven digits remain if
+// masses differ by 1e9 and a heavy load is at the end of a chain. Here the directions are sorted into levels. Those of
+// the first level move the heaviest bodies, all others leave these at rest, and so on. An entry of D' then contains
+// contributions of those bodies only that both directions move.
 #include <algorithm>
 #include <cmath>
 #include <numeric>
@@ -15,9 +15,9 @@
 
 namespace ckc {
 
-constexpr double min_mass_ratio = 1e5;      // ratio of masses from which rounding is checked
+constexpr double min_mass_ratio = 1e5;      // ratio of masses above which rounding is checked
 constexpr double max_level_ratio = 1e3;     // ratio of inertias within a level
-constexpr double motion_tolerance = 1e-13;  // relative to the largest motion in a level; below it is rounding
+constexpr double motion_tolerance = 1e-13;  // rounding of a motion, relative to the largest one in its level
 
 bool Core::has_uneven_masses() const {
   double lightest = std::numeric_limits<double>::infinity(), heaviest = 0.0;
@@ -28,13 +28,15 @@ bool Core::has_uneven_masses() const {
   return heaviest > min_mass_ratio * lightest && n > rank;
 }
 
-// Six velocity components per body: of the centre of mass, and of the angular velocity along the principal axes.
-// `motion` is the component per tangent direction, `rate` its acceleration without them and without gravity, `load`
-// the gyroscopic moment. `size` is the inertia that the component contributes. All three components of a kind share
-// it, so a heavy body that no direction moves along one axis does not count as light.
+// Six velocity components per body: of the centre of mass in world axes, and of the angular velocity in principal axes.
 struct Core::Components {
-  std::vector<double> weight, rate, load, size;
-  std::vector<Vector> motion;
+  std::vector<double> weight;  // mass or moment of inertia
+  std::vector<double> rate;    // acceleration without tangent motion, minus gravity
+  std::vector<double> load;    // gyroscopic moment
+  // Inertia that the component contributes at most. The three components of a kind share it, so that a heavy body that
+  // no direction moves along one axis does not count as light.
+  std::vector<double> size;
+  std::vector<Vector> motion;  // component per tangent direction
 };
 
 void Core::body_velocity_components(Components& of) {
@@ -77,11 +79,11 @@ void Core::body_velocity_components(Components& of) {
 bool Core::project_by_mass_levels(In u_tree, Out a) {
   Components of;
   body_velocity_components(of);
-  const int d_ = n - rank, count = static_cast<int>(of.weight.size());
+  const int freedoms = n - rank, count = static_cast<int>(of.weight.size());
   Indices order(count), level(count);
   std::iota(order.begin(), order.end(), 0);
   std::stable_sort(order.begin(), order.end(), [&](int i, int k) { return of.size[i] > of.size[k]; });
-  Matrix basis(d_, d_), remaining = Matrix::Identity(d_, d_);
+  Matrix basis(freedoms, freedoms), remaining = Matrix::Identity(freedoms, freedoms);
   Indices level_of;  // by column of the basis
   int levels = 0;
   for (int first = 0, last; first < count; first = last, ++levels) {
@@ -99,12 +101,12 @@ bool Core::project_by_mass_levels(In u_tree, Out a) {
     Eigen::Index motion_rank = 0;
     while (motion_rank < pivots.size() && pivots(motion_rank) > motion_tolerance * largest) ++motion_rank;
     const Matrix rotated = remaining * Matrix(qr.householderQ());
-    basis.middleCols(d_ - free, motion_rank) = rotated.leftCols(motion_rank);
+    basis.middleCols(freedoms - free, motion_rank) = rotated.leftCols(motion_rank);
     level_of.resize(level_of.size() + static_cast<size_t>(motion_rank), levels);
     remaining = rotated.rightCols(free - motion_rank);
   }
   if (remaining.cols()) return false;  // some direction moves no mass
-  Matrix motion(count, d_), D_levels(d_, d_);
+  Matrix motion(count, freedoms), D_levels(freedoms, freedoms);
   for (int r = 0; r < count; ++r) motion.row(r).noalias() = of.motion[r].transpose() * basis;
   const Matrix directions = tangent_ * basis;
   if (springs.has_elastic_forces)
@@ -114,7 +116,7 @@ bool Core::project_by_mass_levels(In u_tree, Out a) {
   y_ = u_tree + elastic_ + damping_tree - tree.armature().cwiseProduct(x_);
   Vector force = directions.transpose() * y_;
   D_levels.noalias() = directions.transpose() * tree.armature().asDiagonal() * directions;
-  for (int i = 0; i < d_; ++i)
+  for (int i = 0; i < freedoms; ++i)
     for (int r = 0; r < count; ++r) {
       if (level[r] < level_of[i]) continue;
       force(i) -= (of.weight[r] * of.rate[r] + of.load[r]) * motion(r, i);

@@ -9,11 +9,11 @@
 
 namespace ckc {
 
-// Relative sizes of the last pivot of J: below the first its rank is lost, below the second the metric of D' is not
-// used.
+// Last pivot of J, relative to the first: below `rank_lost_pivot` the rank is lost, below the other the metric of D' is
+// not used.
 constexpr double rank_lost_pivot = 1e-12, min_pivot_for_inertia_metric = 1e-3;
-// The partition of the tangent basis is kept while its pivots are larger and its entries smaller than these. A new
-// partition must satisfy the stricter last bound.
+// The tangent basis keeps its partition while the pivot ratio is larger and its entries are smaller than these. A new
+// partition has to satisfy the stricter last bound.
 constexpr double min_partition_pivot = 1e-2, max_partition_slope = 4.0, max_new_partition_slope = 3.0;
 // Rounding error of an acceleration, relative to the forces that cause it.
 constexpr double acceleration_rounding_factor = 1e-13;
@@ -59,11 +59,10 @@ void Core::take_pivots_as_partition() {
   if (pivots_ == basis_z_) return;
   basis_z_ = pivots_;
   basis_q_.assign(order.data() + rank, order.data() + n);
-  basis_.shape(constraints.closure.rows, rank, constraints.pattern_in(basis_z_, n));
+  basis_.set_pattern(constraints.closure.rows, rank, constraints.pattern_in(basis_z_, n));
 }
 
-// J P = Q [R S]. The columns that pivoting leaves over are the freedoms. Lengths are measured in the mechanism's
-// size.
+// J P = Q [R S]. The columns without a pivot are the freedoms. Lengths are in units of the mechanism's size.
 bool Core::find_basis_by_pivoting(double min_pivot) {
   qr_.compute(constraints.J * scales.columns.asDiagonal());
   const auto& r = qr_.matrixQR();
@@ -192,16 +191,16 @@ bool Core::find_basis_for_check() {
   return true;
 }
 
-// The scale is the acceleration that the forces would cause without cancellation: near an equilibrium the
-// accelerations themselves are rounding.
+// The difference is relative to the acceleration that the forces would cause without cancellation, because near an
+// equilibrium the accelerations themselves are rounding errors.
 double Core::relative_difference(In a, In reference) {
   const Vector& units = scales.columns;
   double largest = reference.cwiseQuotient(units).lpNorm<Eigen::Infinity>();
   for (int k = 0; k < n - rank; ++k) {
     const auto direction = tangent_.col(k);
     const double inertia = direction.cwiseAbs2().dot(D_tree().diagonal());
-    const double alone = inertia > 0.0 ? direction.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
-    largest = std::max(largest, alone * direction.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
+    const double uncancelled = inertia > 0.0 ? direction.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
+    largest = std::max(largest, uncancelled * direction.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
   }
   const double difference = (a - reference).cwiseQuotient(units).lpNorm<Eigen::Infinity>();
   if (!std::isfinite(difference)) return std::numeric_limits<double>::infinity();
@@ -281,23 +280,23 @@ void Core::minimum_norm_multipliers(In force, Out lambda) {
 
 bool Core::differentiate(In u_tree, In acceleration) {
   compute_bias(), compute_D_tree();
-  multiply_D_tree(acceleration, lacking_force_);
-  lacking_force_ += bias_tree - damping_tree - u_tree;
+  multiply_D_tree(acceleration, unbalanced_force_);
+  unbalanced_force_ += bias_tree - damping_tree - u_tree;
   lambda_.setZero();
-  minimum_norm_multipliers(lacking_force_, lambda_);
+  minimum_norm_multipliers(unbalanced_force_, lambda_);
   derivatives.compute(q_tree, v_tree, acceleration, lambda_);
   return derivatives.force_by_q.allFinite() && derivatives.row_by_q.allFinite();
 }
 
-bool Core::solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& change) {
-  change.resize(n, force.cols());
+bool Core::solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& derivatives) {
+  derivatives.resize(n, force.cols());
   for (Eigen::Index k = 0; k < force.cols(); ++k) {
     residual_ = residual.col(k);
     if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
     if (!k) factorize_tangent_inertia();
     multiply_D_tree(x_, y_);
     y_ = force.col(k) - y_;
-    add_force_response(y_, change.col(k));
+    add_force_response(y_, derivatives.col(k));
   }
   return true;
 }
@@ -345,9 +344,9 @@ bool Core::acceleration_derivatives(In q_at, In v, In correction, AppliedForce& 
     if (!differentiate(force, a)) return false;
     const DynamicsDerivatives& by = derivatives;
     const auto right_hand_side = [this](const Matrix& u_part, const Matrix& tree_part) -> const Matrix& {
-      change_ = -tree_part;
-      if (u_part.size()) change_ += u_part;
-      return change_;
+      force_derivative_ = -tree_part;
+      if (u_part.size()) force_derivative_ += u_part;
+      return force_derivative_;
     };
     if (!solve_acceleration_derivatives(right_hand_side(u_by_q, by.force_by_q), by.row_by_q, by_q) ||
         !solve_acceleration_derivatives(right_hand_side(u_by_v, by.force_by_v), by.row_by_v, by_v))

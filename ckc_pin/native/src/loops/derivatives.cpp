@@ -65,24 +65,25 @@ void DynamicsDerivatives::add_row(int row, const AttachedVector& x, const Vector
   }
 }
 
-// Second derivative of force . x along two coordinates. A coordinate rotates the axes of its own joint and of all
-// below.
+// Second derivative of force . x along two coordinates. A coordinate rotates the axes of its own joint and of the
+// joints below it.
 void DynamicsDerivatives::add_curvature(const AttachedVector& x, const Vector3& force) {
   const Indices& support = tree_.support[x.joint];
   for (size_t b = 0; b < support.size(); ++b)
     for (size_t a = 0; a < support.size(); ++a) {
-      const int along = support[a], of = support[b];
-      const bool turns = a <= b || tree_.joint_of[along] == tree_.joint_of[of];
-      const size_t above = turns ? a : b, below = turns ? b : a;
-      const Vector3 turn = tree_.jacobian().col(support[above]).tail<3>();
-      force_by_q(of, along) -= force.dot(turn.cross(Vector3(x.by_q.col(below))));
+      const int column = support[a], row = support[b];
+      const bool rotates = a <= b || tree_.joint_of[column] == tree_.joint_of[row];
+      const size_t above = rotates ? a : b, below = rotates ? b : a;
+      const Vector3 axis = tree_.jacobian().col(support[above]).tail<3>();
+      force_by_q(row, column) -= force.dot(axis.cross(Vector3(x.by_q.col(below))));
     }
 }
 
 void DynamicsDerivatives::add_product(const AttachedVector& x, const AttachedVector& y, double weight) {
-  const Indices &of = tree_.support[x.joint], &along = tree_.support[y.joint];
-  for (size_t i = 0; i < of.size(); ++i)
-    for (size_t k = 0; k < along.size(); ++k) force_by_q(of[i], along[k]) -= weight * x.by_q.col(i).dot(y.by_q.col(k));
+  const Indices &rows = tree_.support[x.joint], &columns = tree_.support[y.joint];
+  for (size_t i = 0; i < rows.size(); ++i)
+    for (size_t k = 0; k < columns.size(); ++k)
+      force_by_q(rows[i], columns[k]) -= weight * x.by_q.col(i).dot(y.by_q.col(k));
 }
 
 void DynamicsDerivatives::add_component(const Component& row, double lambda) {
@@ -103,8 +104,8 @@ void DynamicsDerivatives::add_dot(const Dot& row, double lambda) {
 
 void DynamicsDerivatives::add_distance(const Distance& row, double lambda) {
   const AttachedVector &a = points_[row.pair], &b = points_[pairs_ + row.pair];
-  const double part = 1.0 / row.length, weight = part * lambda;
-  const Vector3 r = part * (a.x - b.x), r_dot = part * (a.x_dot - b.x_dot), r_ddot = part * (a.x_ddot - b.x_ddot);
+  const double scale = 1.0 / row.length, weight = scale * lambda;
+  const Vector3 r = scale * (a.x - b.x), r_dot = scale * (a.x_dot - b.x_dot), r_ddot = scale * (a.x_ddot - b.x_ddot);
   add_row(row.out, a, r, r_dot, r_ddot), add_row(row.out, b, -r, -r_dot, -r_ddot);
   add_curvature(a, lambda * r), add_curvature(b, -lambda * r);
   add_product(a, a, weight), add_product(b, b, weight), add_product(a, b, -weight), add_product(b, a, -weight);
@@ -118,52 +119,54 @@ void DynamicsDerivatives::add_log(const RelativeLog& rows, In lambda) {
   const Vector3 omega_b = tree_.velocity(rows.joint_b).tail<3>();
   const Vector3 omega = omega_b - tree_.velocity(rows.joint_a).tail<3>();
   const Vector3 alpha = (tree_.acceleration(rows.joint_b) - tree_.acceleration(rows.joint_a)).tail<3>();
-  const Vector3 turning = alpha - omega_b.cross(omega), y = r_b.transpose() * omega, y_dot = r_b.transpose() * turning;
+  const Vector3 relative_alpha = alpha - omega_b.cross(omega);
+  const Vector3 y = r_b.transpose() * omega, y_dot = r_b.transpose() * relative_alpha;
   const Vector3 u_dot = log.value * y;
   const Matrix3 value_dot = log.derivative(u_dot);
   const Vector3 force(lambda(rows.out[0]), lambda(rows.out[1]), lambda(rows.out[2]));
   const int n = tree_.n;
-  AttachedVector::Columns place = AttachedVector::Columns::Zero(3, n), velocity = place, rate = place,
-                          rate_by_v = place, of_b = place, velocity_b = place;
-  const auto put = [&](int joint, double sign) {
+  AttachedVector::Columns angle = AttachedVector::Columns::Zero(3, n), velocity = angle, rate = angle,
+                          rate_by_v = angle, of_b = angle, velocity_b = angle;
+  const auto add_joint = [&](int joint, double sign) {
     const Indices& support = tree_.support[joint];
     const JointMotionDerivatives& s = joint_motion_[joint];
     for (size_t k = 0; k < support.size(); ++k) {
       const int j = support[k];
-      place.col(j) += sign * s.axis.col(k).tail<3>(), velocity.col(j) += sign * s.velocity_by_q.col(k).tail<3>();
+      angle.col(j) += sign * s.axis.col(k).tail<3>(), velocity.col(j) += sign * s.velocity_by_q.col(k).tail<3>();
       rate.col(j) += sign * s.acceleration_by_q.col(k).tail<3>(),
           rate_by_v.col(j) += sign * s.acceleration_by_v.col(k).tail<3>();
       if (sign > 0) of_b.col(j) = s.axis.col(k).tail<3>(), velocity_b.col(j) = s.velocity_by_q.col(k).tail<3>();
     }
   };
-  put(rows.joint_a, -1.0), put(rows.joint_b, 1.0);
-  const auto three = [&](Matrix& of, int j, const Vector3& x) {
-    for (int i = 0; i < 3; ++i) of(rows.out[i], j) += x(i);
+  add_joint(rows.joint_a, -1.0), add_joint(rows.joint_b, 1.0);
+  const auto add_to_rows = [&](Matrix& matrix, int j, const Vector3& x) {
+    for (int i = 0; i < 3; ++i) matrix(rows.out[i], j) += x(i);
   };
   for (int j = 0; j < n; ++j) {
-    const Vector3 theta = place.col(j), theta_b = of_b.col(j), omega_j = velocity.col(j);
+    const Vector3 theta = angle.col(j), theta_b = of_b.col(j), omega_j = velocity.col(j);
     const Vector3 u_j = log.value * (r_b.transpose() * theta);
     const Vector3 y_j = r_b.transpose() * (omega_j - theta_b.cross(omega));
-    const Vector3 turning_j = rate.col(j) - velocity_b.col(j).cross(omega) - omega_b.cross(omega_j);
-    const Vector3 y_dot_j = r_b.transpose() * (turning_j - theta_b.cross(turning));
+    const Vector3 relative_alpha_j = rate.col(j) - velocity_b.col(j).cross(omega) - omega_b.cross(omega_j);
+    const Vector3 y_dot_j = r_b.transpose() * (relative_alpha_j - theta_b.cross(relative_alpha));
     const Vector3 u_dot_j = log.derivative(u_j) * y + log.value * y_j;
-    three(J, j, u_j), three(rate_by_q, j, u_dot_j);
-    three(row_by_q, j,
-          log.second_derivative(u_j, u_dot) * y + log.derivative(u_dot_j) * y + value_dot * y_j +
-              log.derivative(u_j) * y_dot + log.value * y_dot_j);
-    // the derivative of omega with respect to a velocity is the derivative of the orientation along its coordinate
+    add_to_rows(J, j, u_j), add_to_rows(rate_by_q, j, u_dot_j);
+    add_to_rows(row_by_q, j,
+                log.second_derivative(u_j, u_dot) * y + log.derivative(u_dot_j) * y + value_dot * y_j +
+                    log.derivative(u_j) * y_dot + log.value * y_dot_j);
+    // The derivative of omega with respect to v'(j) equals that of the orientation with respect to coordinate j.
     const Vector3 y_v = r_b.transpose() * theta, u_dot_v = log.value * y_v;
-    const Vector3 turning_v = rate_by_v.col(j) - theta_b.cross(omega) - omega_b.cross(theta);
-    three(row_by_v, j, log.derivative(u_dot_v) * y + value_dot * y_v + log.value * (r_b.transpose() * turning_v));
+    const Vector3 relative_alpha_v = rate_by_v.col(j) - theta_b.cross(omega) - omega_b.cross(theta);
+    add_to_rows(row_by_v, j,
+                log.derivative(u_dot_v) * y + value_dot * y_v + log.value * (r_b.transpose() * relative_alpha_v));
     for (int i = 0; i < n; ++i) {  // the force on coordinate i
-      const Vector3 theta_i = place.col(i);
+      const Vector3 theta_i = angle.col(i);
       if (theta_i.isZero(0)) continue;
       const Indices& above = tree_.ancestors[i];
-      const bool turns = tree_.joint_of[i] == tree_.joint_of[j] || std::binary_search(above.begin(), above.end(), j);
+      const bool rotates = tree_.joint_of[i] == tree_.joint_of[j] || std::binary_search(above.begin(), above.end(), j);
       const Vector3 axis = tree_.jacobian().col(j).tail<3>();
-      const Vector3 turned = (turns ? axis.cross(theta_i) : Vector3::Zero()) - theta_b.cross(theta_i);
+      const Vector3 rotated = (rotates ? axis.cross(theta_i) : Vector3::Zero()) - theta_b.cross(theta_i);
       force_by_q(i, j) -=
-          force.dot(log.derivative(u_j) * (r_b.transpose() * theta_i) + log.value * (r_b.transpose() * turned));
+          force.dot(log.derivative(u_j) * (r_b.transpose() * theta_i) + log.value * (r_b.transpose() * rotated));
     }
   }
 }
@@ -188,14 +191,14 @@ void DynamicsDerivatives::add_springs() {
     Vector &by = by_, &dot_by = dot_by_;  // derivatives of the length and of its rate
     by.setZero(), dot_by.setZero();
     const double length_dot = r.dot(r_dot) / length;
-    const auto put = [&](const AttachedVector& x, double sign) {
+    const auto add_end = [&](const AttachedVector& x, double sign) {
       const Indices& support = tree_.support[x.joint];
       for (size_t i = 0; i < support.size(); ++i) {
         by(support[i]) += sign * r.dot(x.by_q.col(i)) / length;
         dot_by(support[i]) += sign * (r_dot.dot(x.by_q.col(i)) + r.dot(x.dot_by_q.col(i))) / length;
       }
     };
-    put(a, 1.0), put(b, -1.0);
+    add_end(a, 1.0), add_end(b, -1.0);
     dot_by -= length_dot / length * by;
     const double pull = s.stiffness(k) * (length - s.rest_length(k)) + s.damping(k) * length_dot,
                  weight = -pull / length;

@@ -1,7 +1,7 @@
 // Exact derivatives of the terms of eq. 1 with respect to q' (tangent coordinates) and v'.
 //
-// Pinocchio differentiates the tree. Constraint rows and springs consist of scalar products of points and directions,
-// phi = a . b. Their derivatives follow from phi_ddot = a_ddot . b + 2 a_dot . b_dot + a . b_ddot.
+// Pinocchio differentiates the terms of the tree. Constraint rows and springs consist of scalar products phi = a . b of
+// points and directions. Their derivatives follow from phi_ddot = a_ddot . b + 2 a_dot . b_dot + a . b_ddot.
 #pragma once
 
 #include "tree/joint_motion_derivatives.hpp"
@@ -20,15 +20,16 @@ class DynamicsDerivatives {
   Matrix force_by_q, force_by_v;  // (n, n): of D'a + C'v + h' minus springs, dampers and J^T lambda
   Matrix row_by_q, row_by_v;      // (rows, n): of J a + J_dot v
   Matrix rate_by_q, J;            // (rows, n): of J v, and of phi
-  // ends of springs, unless `impulsive`
+  // Ends of a spring at the last state; not computed if `impulsive`.
   const AttachedVector& spring_end_a(int spring) const { return spring_ends_[spring]; }
   const AttachedVector& spring_end_b(int spring) const { return spring_ends_[spring_ends_.size() / 2 + spring]; }
 
  private:
-  // Add the derivatives of a row with the given weights of x, x_dot and x_ddot.
+  // Add the contribution of x to a row phi = w . x, where w depends on time.
   void add_row(int row, const AttachedVector& x, const Vector3& w, const Vector3& w_dot, const Vector3& w_ddot);
-  void add_curvature(const AttachedVector& x, const Vector3& force);                  // of force . x
-  void add_product(const AttachedVector& x, const AttachedVector& y, double weight);  // of x . y, mixed derivatives
+  // Subtract the second derivatives of force . x, and the mixed derivatives of weight x . y, from force_by_q.
+  void add_curvature(const AttachedVector& x, const Vector3& force);
+  void add_product(const AttachedVector& x, const AttachedVector& y, double weight);
   void add_component(const Component& row, double lambda);
   void add_dot(const Dot& row, double lambda);
   void add_distance(const Distance& row, double lambda);
@@ -39,8 +40,9 @@ class DynamicsDerivatives {
   const Closure& closure_;
   const SpringTable& springs_;
   const int pairs_;
-  std::vector<JointMotionDerivatives> joint_motion_;  // by joint, for joints that rows and springs are attached to
-  Indices joints_, used_points_, used_directions_;    // the points and directions that rows use
+  Indices joints_;                                    // joints that rows and springs are attached to
+  std::vector<JointMotionDerivatives> joint_motion_;  // by joint, valid for joints_
+  Indices used_points_, used_directions_;             // points and directions of the closure that rows use
   std::vector<AttachedVector> points_, directions_, spring_ends_;
   Vector by_, dot_by_;
 };

@@ -5,13 +5,14 @@
 
 namespace ckc {
 
-// Relative to the accelerations that the forces cause. Mechanisms with similar masses have a tenth of it or less.
+// Accepted rounding error, relative to the accelerations that the forces cause. Mechanisms with similar masses have a
+// tenth of it or less.
 constexpr double max_rounding_per_coordinate = 5e-14;
 // Accepted steps between checks. A check costs about two right-hand sides with Pinocchio's terms.
 constexpr int first_interval = 8, regular_interval = 128, retry_interval = 16;
 
 // Project (q', v') onto the constraint manifold. Off the manifold redundant rows contradict each other, so that
-// eliminations which keep different rows differ. False if the compiled elimination would need a pivot.
+// eliminations which use different rows differ. False if the compiled elimination would need a pivot.
 static bool project_onto_manifold(Core& core, Vector& q_tree, Vector& v) {
   constexpr int newton_steps = 3;  // starting from a state within the run's tolerance
   Vector step(core.n);

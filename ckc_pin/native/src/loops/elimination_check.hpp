@@ -1,10 +1,9 @@
 // Chooses the elimination by which a run computes the acceleration of eq. 1, from its rounding errors at the start
 // and along the motion.
 //
-// The compiled elimination does not pivot, and its order was chosen for the masses in the mechanism's files. With
-// very different masses it can round up to a million times as much as projection on the tangent space: if a light
-// body carries a heavy load, the acceleration that the load alone would cause cancels. Step size control then sees
-// noise.
+// The compiled elimination does not pivot, and its order was chosen for the masses in the mechanism's files. With very
+// different masses its rounding errors can be a million times those of projection on the tangent space: if a light body
+// carries a heavy load, the acceleration that the load alone would cause cancels. Step size control then sees noise.
 #pragma once
 
 #include "tree/types.hpp"
@@ -30,11 +29,12 @@ class EliminationCheck {
  private:
   void check(Core& core);
 
-  // whether there is something to check; whether masses differ widely
-  bool is_active_ = false, has_uneven_masses_ = false;
-  bool has_started_ = false, is_remembered_ = false;
-  // accepted steps until the next check, and from that to the one after it
-  int steps_until_check_ = 0, next_interval_ = 0;
+  bool is_active_ = false;          // whether there are two methods to compare
+  bool has_uneven_masses_ = false;  // so that projection has to be checked too
+  bool has_started_ = false;
+  bool is_remembered_ = false;  // whether q_tree_, v_ and u_tree_ are a state to check
+  int steps_until_check_ = 0;   // accepted steps until the next check
+  int next_interval_ = 0;       // accepted steps from that check to the following one
   Vector q_tree_, v_, u_tree_;
 };
 

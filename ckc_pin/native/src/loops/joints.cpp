@@ -7,7 +7,8 @@
 
 namespace ckc {
 
-// times the rounding error of a decision: error allowed until the next decision
+// A locked joint stays locked while its force violates the bound by less than this times the rounding error of the
+// decision to lock it.
 constexpr double rounding_hysteresis = 4.0;
 
 Joints::Joints(JointTable table_, int n)
@@ -45,8 +46,8 @@ void Joints::add_friction_derivative(In v, Out slopes) const {
 int Joints::find_joint_beyond_stop(In q_tree, const Indices& at, double tolerance) const {
   if (!has_stops) return -1;
   for (size_t k = 0; k < at.size(); ++k) {
-    const double x = q_tree(at[k]), off = std::max(table.lower(k) - x, x - table.upper(k));
-    if (off > tolerance * table.reach(k) && !is_locked(static_cast<int>(k))) return static_cast<int>(k);
+    const double x = q_tree(at[k]), distance = std::max(table.lower(k) - x, x - table.upper(k));
+    if (distance > tolerance * table.reach(k) && !is_locked(static_cast<int>(k))) return static_cast<int>(k);
   }
   return -1;
 }
@@ -79,16 +80,16 @@ void Joints::factorize_locked_rows(const Matrix& responses) {
   for (rank_ = 0; rank_ < m && values(m - 1 - rank_) > dependent_row_tolerance * values(m - 1);) ++rank_;
 }
 
-// Minimum-norm holding forces that give the locked coordinates the acceleration x. Each force is scaled by what moves
-// its own joint.
+// Minimum-norm forces that cancel the acceleration x of the locked coordinates. Each force is scaled by the response
+// of its own joint.
 void Joints::minimum_norm_forces(const Matrix& responses, In x, Vector& force) {
   factorize_locked_rows(responses);
   const auto m = static_cast<Eigen::Index>(locked.size());
-  wanted_acceleration_.resize(m);
-  for (Eigen::Index i = 0; i < m; ++i) wanted_acceleration_(i) = -scale_(i) * x(locked[i]);
+  target_acceleration_.resize(m);
+  for (Eigen::Index i = 0; i < m; ++i) target_acceleration_(i) = -scale_(i) * x(locked[i]);
   const auto vectors = eigen_.eigenvectors().rightCols(rank_);
   const Vector components =
-      (vectors.transpose() * wanted_acceleration_).cwiseQuotient(eigen_.eigenvalues().tail(rank_));
+      (vectors.transpose() * target_acceleration_).cwiseQuotient(eigen_.eigenvalues().tail(rank_));
   force.noalias() = vectors * components;
   for (Eigen::Index i = 0; i < m; ++i) force(i) *= scale_(i);
 }
@@ -114,7 +115,7 @@ Vector Joints::force_rounding(const Matrix& inverse_root, In rounding) const {
   return rounding_hysteresis * (inverse.cwiseAbs() * scale_.cwiseProduct(rounding));
 }
 
-// If joints are held in more than one way, their forces are not unique. Such joints are left out.
+// If the holding forces are not unique, no joint is returned.
 Indices Joints::find_joints_at_force_limit(In rounding) const {
   Indices at;
   if (rank_ < A_.rows()) return at;
@@ -127,17 +128,17 @@ Indices Joints::find_joints_at_force_limit(In rounding) const {
   return at;
 }
 
-// Largest distance of the forces from their bounds. If joints are held in more than one way, forces that cancel each
-// other are chosen to maximize it. The bounds are widened by rounding.
+// Largest distance of the forces from their bounds, which are widened by rounding. If the forces are not unique, those
+// that maximize the distance are chosen.
 double Joints::holding_margin(In rounding) {
   const Eigen::Index m = A_.rows();
   const Matrix inverse_root = this->inverse_root();
-  const Vector scaled = force_rounding(inverse_root, rounding);
-  Vector force(m), low(m), high(m);  // scaled by what moves each force's own joint
+  const Vector rounding_bound = force_rounding(inverse_root, rounding);
+  Vector force(m), low(m), high(m);  // each force scaled by the response of its own joint
   for (Eigen::Index i = 0; i < m; ++i) {
     force(i) = holding_forces_(i) / scale_(i);
-    low(i) = lower_force(locked[i]) / scale_(i) - scaled(i);
-    high(i) = upper_force(locked[i]) / scale_(i) + scaled(i);
+    low(i) = lower_force(locked[i]) / scale_(i) - rounding_bound(i);
+    high(i) = upper_force(locked[i]) / scale_(i) + rounding_bound(i);
   }
   double margin = infinite;
   if (rank_ == m) {
@@ -145,7 +146,7 @@ double Joints::holding_margin(In rounding) {
       margin = std::min(margin, std::min(force(i) - low(i), high(i) - force(i)) / inverse_root.col(i).norm());
     return margin;
   }
-  margin = maximize_slack(eigen_.eigenvectors().leftCols(m - rank_), force, low, high);
+  margin = maximize_bound_distance(eigen_.eigenvectors().leftCols(m - rank_), force, low, high);
   return std::isfinite(margin) ? margin : 1.0;
 }
 

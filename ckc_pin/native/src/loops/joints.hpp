@@ -16,14 +16,16 @@
 
 namespace ckc {
 
-// relative eigenvalue of the scaled A below which rows depend on others
+// Eigenvalue of the scaled A, relative to the largest, below which rows are linearly dependent.
 constexpr double dependent_row_tolerance = 1e-10;
 
 struct JointTable {
-  Vector friction, lower, upper, restitution;  // (n); infinite where there is no stop
-  Vector reach;                                // (n): unit of each coordinate, one radian or the mechanism's size
-  double size = 1.0;                           // size of the mechanism, m
-  // rate at which smooth friction reaches tanh(1) of its value; zero: friction with stick-slip events
+  Vector friction;      // (n), N m or N
+  Vector lower, upper;  // (n): stops, infinite where there are none
+  Vector restitution;   // (n)
+  Vector reach;         // (n): unit of each coordinate, one radian or the mechanism's size
+  double size = 1.0;    // size of the mechanism, m
+  // Velocity scale of the tanh of smooth friction, rad/s or m/s. Zero: friction with stick-slip events.
   double smoothing = 0.0;
 };
 
@@ -51,7 +53,7 @@ class Joints {
   Indices stop_side;          // (n): -1 at the lower stop, 1 at the upper, zero otherwise
   Indices locked;             // coordinates that stick or are at a stop
   bool is_locked(int k) const { return std::find(locked.begin(), locked.end(), k) != locked.end(); }
-  Indices immobile;  // coordinates with friction that the loops do not allow to move
+  Indices immobile;  // coordinates with friction that the loops block
   Vector locked_at;  // (n): positions of the locked coordinates
   // Add the friction of sliding joints at velocity v.
   void add_friction_force(In v, Out force) const;
@@ -78,13 +80,13 @@ class Joints {
   // Distance of the last holding forces from their bounds; negative if no forces within the bounds hold the joints.
   // `rounding`: error of the acceleration of each locked coordinate.
   double holding_margin(In rounding);
-  // Locked coordinates (indices in `locked`) whose force is at its bound within rounding.
+  // Return the locked joints (indices in `locked`) whose force is at its bound within rounding.
   Indices find_joints_at_force_limit(In rounding) const;
   double rate_rounding = 0.0;    // 1/s: rounding of rates, relative to `reach`, at the last mode transition
   double rounding_factor = 1.0;  // multiplies rounding errors; grows when modes change repeatedly at one instant
   // Compute the change of a velocity or small displacement x that makes its locked coordinates zero.
   void compute_correction(const Matrix& responses, In x, Out step);
-  // by locked coordinate, from the last correction
+  // By locked coordinate, from the last correction.
   const Vector& correction_forces() const { return correction_forces_; }
 
   // --- history ---
@@ -96,16 +98,16 @@ class Joints {
   static constexpr double infinite = std::numeric_limits<double>::infinity();
   void factorize_locked_rows(const Matrix& responses);
   void minimum_norm_forces(const Matrix& responses, In x, Vector& force);
-  Matrix inverse_root() const;  // (rank, m), R with R^T R the pseudoinverse of A
-  Vector force_rounding(const Matrix& inverse_root, In rounding) const;  // of forces, scaled as in A
+  Matrix inverse_root() const;  // (rank, m): R with R^T R the pseudoinverse of A_
+  Vector force_rounding(const Matrix& inverse_root, In rounding) const;  // rounding of the scaled forces
   const bool smooth_friction_;
   double friction_work_ = 0.0;
   Vector accounted_at_;  // (n): coordinates at the last accounting
-  // Scaled matrix A = G D^-1 G^T of the locked rows, its rank, and the minimum-norm holding forces.
+  // A_: responses of the locked coordinates to unit forces on them, scaled to a unit diagonal by scale_; its rank.
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;
   Eigen::Index rank_ = 0;
   Matrix A_;
-  Vector scale_, holding_forces_, wanted_acceleration_, correction_forces_;
+  Vector scale_, holding_forces_, target_acceleration_, correction_forces_;
 };
 
 }  // namespace ckc

@@ -5,10 +5,10 @@
 
 namespace ckc {
 
-// of the coordinates' part of an orthonormal basis; below it they are no valid chart
+// Coordinates are a valid chart if their rows of an orthonormal tangent basis have a larger smallest singular value.
 constexpr double min_chart_singular_value = 1e-5;
-constexpr double min_phi_z_pivot = 1e-2;  // of phi_z: above it q is a valid chart
-// of the largest entry of a tangent basis: below it a coordinate is fixed by locked ones
+constexpr double min_phi_z_pivot = 1e-2;  // pivot ratio of phi_z above which q is a valid chart
+// A coordinate is fixed by locked ones if its row of the tangent basis is smaller, relative to the largest entry.
 constexpr double locked_motion_tolerance = 1e-9;
 
 Linearization::Linearization(std::unique_ptr<Core> core_, Matrix transmission_)
@@ -48,14 +48,14 @@ bool Linearization::find_basis() {
     c.factorize_phi_z();
     uses_rho_ = c.phi_z.pivot_ratio() > min_phi_z_pivot;
   }
-  if (uses_rho_) return c.compute_rho(), T = c.rho, at = c.q, true;
+  if (uses_rho_) return c.compute_rho(), T = c.rho, coordinates = c.q, true;
   const Matrix* tangent = c.compute_tangent_basis();
   if (!tangent) return false;
   T = *tangent, choose_coordinates(c.basis_coordinates());
   return true;
 }
 
-// J P = Q [R S]. The columns that pivoting leaves over are the freedoms.
+// J P = Q [R S]. The columns without a pivot are the freedoms.
 void Linearization::set_basis_from(const Pivoted& qr) {
   const Vector& columns = core->scales.columns;
   const Eigen::Index n = core->n, rank = qr.rank();
@@ -74,18 +74,18 @@ void Linearization::set_basis_from(const Pivoted& qr) {
   choose_coordinates(free);
 }
 
-// Use the mechanism's own q without locked coordinates. If that is no valid chart, use the coordinates of the basis.
+// Use q without its locked coordinates as states. If they are no valid chart, use the coordinates of the basis.
 void Linearization::choose_coordinates(const Indices& free) {
-  at.clear();
-  const double max_entry = locked_motion_tolerance * T.lpNorm<Eigen::Infinity>();
+  coordinates.clear();
+  const double min_entry = locked_motion_tolerance * T.lpNorm<Eigen::Infinity>();
   for (int k : core->q)
-    if (core->joints.locked.empty() || T.row(k).lpNorm<Eigen::Infinity>() > max_entry) at.push_back(k);
-  if (at == free) return;
+    if (core->joints.locked.empty() || T.row(k).lpNorm<Eigen::Infinity>() > min_entry) coordinates.push_back(k);
+  if (coordinates == free) return;
   const auto d = static_cast<Eigen::Index>(free.size());
-  if (static_cast<Eigen::Index>(at.size()) == d) {
-    const auto chart_rows = [&](const Matrix& find_basis) {
+  if (static_cast<Eigen::Index>(coordinates.size()) == d) {
+    const auto chart_rows = [&](const Matrix& basis) {
       Matrix part(d, d);
-      for (Eigen::Index i = 0; i < d; ++i) part.row(i) = find_basis.row(at[i]);
+      for (Eigen::Index i = 0; i < d; ++i) part.row(i) = basis.row(coordinates[i]);
       return part;
     };
     const Matrix free_of_units = core->scales.columns.cwiseInverse().asDiagonal() * T;
@@ -93,11 +93,11 @@ void Linearization::choose_coordinates(const Indices& free) {
     if (chart_rows(orthonormal_basis).jacobiSvd().singularValues()(d - 1) > min_chart_singular_value) {
       const Matrix rotated = chart_rows(T).partialPivLu().transpose().solve(Matrix(T.transpose()));
       T = rotated.transpose();
-      for (Eigen::Index i = 0; i < d; ++i) T.row(at[i]).setZero(), T(at[i], i) = 1.0;
+      for (Eigen::Index i = 0; i < d; ++i) T.row(coordinates[i]).setZero(), T(coordinates[i], i) = 1.0;
       return;
     }
   }
-  at = free;
+  coordinates = free;
 }
 
 // J V = -(d (J v') / d q') T, with zero rows for the states' own coordinates.
@@ -128,23 +128,23 @@ void Linearization::compute_velocity_dependence(In v) {
     for (int k : c.joints.locked) V.row(k).setZero();
   }
   Matrix of_states(d, d);
-  for (Eigen::Index i = 0; i < d; ++i) of_states.row(i) = V.row(at[i]);
+  for (Eigen::Index i = 0; i < d; ++i) of_states.row(i) = V.row(coordinates[i]);
   V.noalias() -= T * of_states;
-  for (int k : at) V.row(k).setZero();
+  for (int k : coordinates) V.row(k).setZero();
 }
 
 void Linearization::assemble_A_B(In v) {
   const Eigen::Index n = T.rows(), d = T.cols(), motors = transmission.rows();
   A.setZero(2 * d, 2 * d), B.setZero(2 * d, motors);
   for (Eigen::Index i = 0; i < d; ++i) {
-    const int row = at[i];
+    const int row = coordinates[i];
     A(i, d + i) = 1.0;
     for (Eigen::Index j = 0; j < d; ++j) {
-      double by_place = 0.0, by_rate = 0.0;
+      double by_position = 0.0, by_rate = 0.0;
       for (Eigen::Index k = 0; k < n; ++k)
-        by_place += acceleration.by_q(row, k) * T(k, j) + acceleration.by_v(row, k) * V(k, j),
+        by_position += acceleration.by_q(row, k) * T(k, j) + acceleration.by_v(row, k) * V(k, j),
             by_rate += acceleration.by_v(row, k) * T(k, j);
-      A(d + i, j) = by_place, A(d + i, d + j) = by_rate;
+      A(d + i, j) = by_position, A(d + i, d + j) = by_rate;
     }
     for (Eigen::Index j = 0; j < motors; ++j) {
       double by_motor = 0.0;
@@ -154,7 +154,7 @@ void Linearization::assemble_A_B(In v) {
   }
   if (core->tree.roots.empty()) return;
   const Matrix rotated = core->tree.bracket_matrix(v) * T;
-  for (Eigen::Index i = 0; i < d; ++i) A.row(i).head(d) -= rotated.row(at[i]);
+  for (Eigen::Index i = 0; i < d; ++i) A.row(i).head(d) -= rotated.row(coordinates[i]);
 }
 
 // D' da + dR = J^T dlambda with R = D' a + C' v' + h' minus applied forces and J^T lambda.

@@ -15,17 +15,17 @@ class Linearization {
   // `transmission`: motor rates per coordinate rate, (motors, n).
   Linearization(std::unique_ptr<Core> core, Matrix transmission);
 
-  // Linearize at (q', v') under u', which does not depend on the state; smooth friction is added. `locked`
-  // coordinates do not move. False if J has lost rank.
+  // Linearize at (q', v') under the constant u' and smooth friction. `locked` coordinates do not move. False if J has
+  // lost rank.
   bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked);
   // After `compute`: the acceleration, minimum-norm multipliers, and the multipliers' derivatives.
   void solve_multipliers();
 
   const std::unique_ptr<Core> core;
   const Matrix transmission;
-  Indices at;   // (d): coordinates of the states
-  Matrix T, V;  // (n, d): derivatives of v' with respect to the states' rates, and their positions
-  Matrix A, B;  // (2 d, 2 d), (2 d, motors)
+  Indices coordinates;  // (d): coordinates of the states
+  Matrix T, V;          // (n, d): derivatives of v' with respect to the rates and to the positions of the states
+  Matrix A, B;          // (2 d, 2 d), (2 d, motors)
   AccelerationDerivatives acceleration;
   Vector lambda;                        // (rows)
   Matrix lambda_q, lambda_v, lambda_u;  // (rows, n)

@@ -14,7 +14,7 @@ Matrix columns_of(const Matrix& a, const Indices& at) {
   return part;
 }
 
-// Append the first columns that pivoting selects, numbered as in `at`.
+// Append the coordinates `at` of the first `count` columns that pivoting selects.
 void append_pivot_columns(const Matrix& a, const Indices& at, int count, Indices& z) {
   const Eigen::ColPivHouseholderQR<Matrix> qr(a);
   for (int k = 0; k < count; ++k) z.push_back(at[qr.colsPermutation().indices()(k)]);

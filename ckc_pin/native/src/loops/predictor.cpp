@@ -37,12 +37,12 @@ void Predictor::add(double t, const Core& core, In q_tree, In v_tree, In w) {
   last_point_ = k;
 }
 
-void Predictor::predict(double t, In numbers, const Chart& chart, const Core& core, In w, Out q_tree) {
+void Predictor::predict(double t, In coordinates, const Chart& chart, const Core& core, In w, Out q_tree) {
   int nearest = last_point_;
   double shortest = 0.0;
   for (int k = 0; k < count_; ++k) {
-    chart.tangent_step(core, points_[k].q_tree, numbers, distance_step_);
-    double distance = 0.0;  // plain loop, so that rounding does not depend on vectorization
+    chart.tangent_step(core, points_[k].q_tree, coordinates, distance_step_);
+    double distance = 0.0;  // a scalar loop, so that rounding does not depend on vectorization
     for (int i = 0; i < core.d; ++i) distance = std::max(distance, std::abs(distance_step_(i)));
     if (k == 0 || distance < shortest) nearest = k, shortest = distance, dq_ = distance_step_;
   }
@@ -51,12 +51,12 @@ void Predictor::predict(double t, In numbers, const Chart& chart, const Core& co
   double a[max_nodes] = {1.0}, b[max_nodes] = {0.0};
   int count = count_ ? choose_points(t, nearest, chosen, a, b) : 1;
   interpolate(base, count, chosen, a, b, core);
-  // Interpolation magnifies the errors of coarse steps: use the nearest point alone.
+  // Interpolation magnifies the errors of large steps. Use the nearest point alone if it is closer.
   if (count > 1 && prediction_error(core) > shortest) {
     count = 1, chosen[0] = nearest, a[0] = 1.0, b[0] = 0.0;
     step_.setZero();
   }
-  if (!count_) chart.tangent_step(core, base.q_tree, numbers, dq_);
+  if (!count_) chart.tangent_step(core, base.q_tree, coordinates, dq_);
   for (int k = 0; k < core.d; ++k) {
     const double q_step = dq_(k);
     dq_(k) -= step_(core.q[k]);
@@ -73,7 +73,7 @@ void Predictor::predict(double t, In numbers, const Chart& chart, const Core& co
   q_tree = base.q_tree;
   core.tree.integrate(q_tree, step_);
   if (!chart.is_trivial()) return;
-  for (int k = 0; k < core.d; ++k) q_tree(core.tree.q_index[core.q[k]]) = numbers(k);  // exact to the last digit
+  for (int k = 0; k < core.d; ++k) q_tree(core.tree.q_index[core.q[k]]) = coordinates(k);  // exact to the last digit
 }
 
 // Tangent step from the base to the configuration that the chosen points predict.
@@ -90,7 +90,7 @@ void Predictor::interpolate(const Point& base, int count, const int* chosen, con
   }
 }
 
-// Distance between the known q and the predicted one.
+// Distance between the q of the prediction and the given one.
 double Predictor::prediction_error(const Core& core) const {
   double error = 0.0;
   for (int k = 0; k < core.d; ++k) error = std::max(error, std::abs(dq_(k) - step_(core.q[k])));
@@ -101,8 +101,8 @@ int Predictor::choose_points(double t, int nearest, int* chosen, double* a, doub
   int order[max_points];
   for (int k = 0; k < count_; ++k) order[k] = k;
   const auto time_distance = [&](int k) { return std::abs(points_[k].t - t); };
-  const int most = std::min(count_, max_nodes);
-  for (int i = 0; i < most; ++i) {  // sort the nearest first
+  const int max_count = std::min(count_, max_nodes);
+  for (int i = 0; i < max_count; ++i) {  // sort the nearest first
     int best = i;
     for (int k = i + 1; k < count_; ++k)
       if (time_distance(order[k]) < time_distance(order[best]) ||
@@ -111,7 +111,7 @@ int Predictor::choose_points(double t, int nearest, int* chosen, double* a, doub
     std::swap(order[i], order[best]);
   }
   if (time_distance(order[0]) > 0.0) {
-    for (int count = most; count > 1; --count) {
+    for (int count = max_count; count > 1; --count) {
       double times[max_nodes], sum = 0.0;
       bool is_off_manifold = false;
       for (int i = 0; i < count; ++i)
@@ -119,7 +119,7 @@ int Predictor::choose_points(double t, int nearest, int* chosen, double* a, doub
       hermite_weights(times, count, t, a, b);
       for (int i = 0; i < count; ++i) sum += std::abs(a[i]);
       if ((!is_off_manifold || time_distance(order[count - 1]) < max_time_constants * epsilon_) &&
-          sum < largest_weight) {
+          sum < max_weight_sum) {
         std::copy(order, order + count, chosen);
         return count;
       }

@@ -1,8 +1,8 @@
 // Predicts z from the last points of a motion on its level sets, as the initial guess of the projection.
 //
-// phi(q, z) = w makes z a function of (q, w) with the known derivatives rho_z and phi_z^-1. The prediction is of
-// first order from the nearest point. Along the motion, which is smooth in t, the last points and their rates are
-// interpolated by Hermite polynomials.
+// phi(q, z) = w makes z a function of (q, w) with the derivatives rho_z and phi_z^-1. A first-order prediction starts
+// from the nearest point. Along the motion, which is smooth in t, Hermite polynomials through the last points and their
+// rates predict more accurately.
 #pragma once
 
 #include "loops/chart.hpp"
@@ -16,15 +16,14 @@ class Predictor {
   void reset(const Core& core, In q_tree);  // forget all points; the first prediction starts there
   // Store the core's configuration, which is on the level set w. It replaces the point at the same t.
   void add(double t, const Core& core, In q_tree, In v_tree, In w);
-  // Predict the configuration at q, given by its `numbers` in a chart.
-  void predict(double t, In numbers, const Chart& chart, const Core& core, In w, Out q_tree);
+  // Predict the configuration at q, given by its `coordinates` in a chart.
+  void predict(double t, In coordinates, const Chart& chart, const Core& core, In w, Out q_tree);
 
  private:
-  // points stored; points interpolated, with polynomials of degree 5
-  static constexpr int max_points = 8, max_nodes = 3;
-  // largest sum of |weights|; larger weights would magnify the points' errors
-  static constexpr double largest_weight = 1e3;
-  static constexpr double max_time_constants = 3.0;  // of epsilon: over longer times the rate of w predicts nothing
+  static constexpr int max_points = 8;               // stored
+  static constexpr int max_nodes = 3;                // interpolated, by polynomials of degree 5
+  static constexpr double max_weight_sum = 1e3;      // of |weights|; larger ones would magnify the errors of the points
+  static constexpr double max_time_constants = 3.0;  // time in epsilon over which the rate of w predicts w
 
   struct Point {
     double t = 0;
@@ -39,8 +38,9 @@ class Predictor {
   int choose_points(double t, int nearest, int* chosen, double* a, double* b) const;
 
   double epsilon_;
-  Point points_[max_points + 1];  // the last one is the starting point
-  int count_ = 0, last_point_ = max_points;
+  Point points_[max_points + 1];  // points_[max_points]: the starting point
+  int count_ = 0;                 // stored points
+  int last_point_ = max_points;   // stored last
   bool visited_level_sets_ = false;
   Vector dq_, distance_step_, w_change_, z_, step_, difference_;
 };

@@ -10,13 +10,14 @@ namespace ckc {
 
 namespace {
 
+// Wrench of a force at a point.
 Vector6 force(const Vector3& at, const Vector3& direction) {
   Vector6 w;
   w << direction, at.cross(direction);
   return w;
 }
 
-// Time derivative of `force`.
+// Rate of `force`.
 Vector6 force_rate(const Vector3& at, const Vector3& direction, const Vector3& at_dot, const Vector3& direction_dot) {
   Vector6 w;
   w << direction_dot, at_dot.cross(direction) + at.cross(direction_dot);
@@ -66,16 +67,16 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   }
 }
 
-void ConstraintRows::set_parameters(Parameter what, In numbers) {
-  if (what == Parameter::point)
-    for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = numbers.segment<3>(3 * k);
-  if (what == Parameter::length)
-    for (auto& row : closure.distances) row.length = numbers(row.out);
+void ConstraintRows::set_parameters(Parameter parameter, In values) {
+  if (parameter == Parameter::point)
+    for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = values.segment<3>(3 * k);
+  if (parameter == Parameter::length)
+    for (auto& row : closure.distances) row.length = values(row.out);
   const auto n = J.cols();
   for (auto& row : closure.affine) {
-    if (what == Parameter::affine)
-      row.coefficients = numbers.segment(n * row.out, n), J.row(row.out) = row.coefficients;
-    if (what == Parameter::affine_offset) row.offset = numbers(row.out);
+    if (parameter == Parameter::affine)
+      row.coefficients = values.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (parameter == Parameter::affine_offset) row.offset = values(row.out);
   }
 }
 

@@ -9,22 +9,23 @@
 
 namespace ckc {
 
-struct Component {
+// The kinds of rows; `out`: index of the row in phi. Pairs of points (A, B) and directions e are those of `Closure`.
+struct Component {  // e . (A - B)
   int out, pair, direction;
 };
-struct Dot {
+struct Dot {  // e_a . e_b
   int out, a, b;
 };
-struct Distance {
+struct Distance {  // (|A - B|^2 - length^2) / (2 length)
   int out, pair;
   double length;
 };
-struct Affine {
+struct Affine {  // coefficients . q' - offset
   int out;
-  Vector coefficients;
+  Vector coefficients;  // (n)
   double offset;
 };
-struct RelativeLog {
+struct RelativeLog {  // log(R_A^T R_B), three rows; R: rotation of the joint times a constant rotation
   int out[3];
   int joint_a, joint_b;
   Matrix3 rotation_a, rotation_b;
@@ -32,8 +33,10 @@ struct RelativeLog {
 
 struct Closure {
   int rows;
-  Indices point_joint, direction_joint;  // the points A of all pairs, then the points B
-  std::vector<Vector3> point_local, direction_local;
+  Indices point_joint;  // joints of the points A of all pairs, then of the points B
+  std::vector<Vector3> point_local;
+  Indices direction_joint;
+  std::vector<Vector3> direction_local;
   std::vector<Component> components;
   std::vector<Dot> dots;
   std::vector<Distance> distances;
@@ -41,6 +44,7 @@ struct Closure {
   std::vector<RelativeLog> logs;
 };
 
+// A wrench on a joint, (force, moment) in world axes at the world's origin, and its rate.
 struct Wrench {
   int joint;
   Vector6 w, w_dot;
@@ -57,8 +61,8 @@ class ConstraintRows {
 
   // Replace one kind of parameter: points concatenated; lengths, coefficients and offsets of all rows.
   enum class Parameter { point, length, affine, affine_offset };
-  void set_parameters(Parameter what, In numbers);
-  // the pattern restricted to `columns`, and numbered among them
+  void set_parameters(Parameter parameter, In values);
+  // Return the pattern restricted to `columns`, as indices into them.
   std::vector<Indices> pattern_in(const Indices& columns, int n) const;
   void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
   void update_jacobian(const Tree& tree);
@@ -71,10 +75,11 @@ class ConstraintRows {
   void update_relative_rotation_rates(const Tree& tree);
 
   int pair_count_;
-  std::vector<Vector3> p_, r_, e_, p_dot_, r_dot_, e_dot_;
-  Indices joints_;  // joints that rows are attached to, and their motion
-  std::vector<Vector6> velocity_, acceleration_;
-  std::vector<std::vector<Wrench>> wrenches_;  // by row
+  std::vector<Vector3> p_, r_, e_;                // points, vectors A - B of the pairs, directions; in world axes
+  std::vector<Vector3> p_dot_, r_dot_, e_dot_;    // their rates
+  Indices joints_;                                // joints that rows are attached to
+  std::vector<Vector6> velocity_, acceleration_;  // by joint, valid for joints_
+  std::vector<std::vector<Wrench>> wrenches_;     // by row
 };
 
 }  // namespace ckc

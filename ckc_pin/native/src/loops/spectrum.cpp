@@ -8,12 +8,12 @@
 namespace ckc {
 
 constexpr int max_dense_rows = 8;              // up to this size a dense decomposition is as cheap
-constexpr double breakdown_tolerance = 1e-14;  // of the matrix: below it the Krylov space is exhausted
-constexpr int first_check = 4;  // Lanczos steps before the first convergence check; checked again after twice as many
-// of the eigenvalue: residual of its vector; the error of the value is its square
+constexpr double breakdown_tolerance = 1e-14;  // relative off-diagonal entry at which the Krylov space is exhausted
+constexpr int first_check = 4;                 // Lanczos steps before the first convergence check; doubled after each
+// Residual of the eigenvector, relative to the eigenvalue. The relative error of the eigenvalue is its square.
 constexpr double residual_tolerance = 1e-7;
 
-// A start vector that is not orthogonal to the smallest singular direction of a symmetric mechanism.
+// Start vector. Equal entries could be orthogonal to the smallest singular direction of a symmetric mechanism.
 static void fill_generic_vector(Out u) {
   for (Eigen::Index k = 0; k < u.size(); ++k) u(k) = 1.0 + 0.1 * static_cast<double>(k % 7);
 }
@@ -33,7 +33,7 @@ SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int c
       coupled_rows[a].push_back(b);
       if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
     }
-  factor_.shape(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
+  factor_.set_pattern(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
   if (!is_dense_) basis_.setZero(m, max_steps_), next_.setZero(m), projections_.setZero(max_steps_);
   // A solver that has computed nothing cannot be copied, so use it once.
   const int size = is_dense_ ? std::max(m, 1) : 1;

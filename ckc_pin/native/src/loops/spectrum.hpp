@@ -20,7 +20,7 @@ class SmallestSingularValue {
   // `pattern`: nonzero columns by row. `rank`: number of singular values that are not zero at a regular state.
   SmallestSingularValue(std::vector<Indices> pattern, int columns, int rank);
 
-  // scales rows and columns first; ignores entries outside the pattern
+  // Scale rows and columns, then compute. Entries outside the pattern are ignored.
   void compute(const Matrix& a, In row_scale, In column_scale);
   double root_mean_square() const { return std::sqrt(mean_square_); }  // of the nonzero singular values
   double value() const { return std::sqrt(std::max(smallest_, 0.0)); }
@@ -29,7 +29,7 @@ class SmallestSingularValue {
   void compute_vectors(Vector& u, Vector& v);
 
  private:
-  static constexpr int max_steps_ = 16;  // of Lanczos' method
+  static constexpr int max_steps_ = 16;  // Lanczos steps
   using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, max_steps_, max_steps_>;
 
   void compute_dense();
@@ -48,7 +48,7 @@ class SmallestSingularValue {
   double mean_square_ = 0.0, smallest_ = 0.0;
   Matrix scaled_, gram_, basis_;
   Vector u_, next_, projections_;
-  Eigen::Matrix<double, max_steps_, 1> diagonal_, off_diagonal_;  // of the tridiagonal matrix
+  Eigen::Matrix<double, max_steps_, 1> diagonal_, off_diagonal_;  // of Lanczos' tridiagonal matrix
   Eigen::SelfAdjointEigenSolver<Matrix> eigen_;                   // values only: vectors would allocate
   Eigen::SelfAdjointEigenSolver<Small> ritz_;
   Factor factor_;

@@ -8,7 +8,7 @@
 
 namespace ckc {
 
-// of |y|: accepted difference between two steps with different numbers of stages
+// Accepted difference between two steps with different numbers of stages, relative to |y|.
 constexpr double max_relative_error = 1e-9;
 constexpr int error_order = 12;  // observed order of the error in the step size
 // Tolerances of the fixed-point iteration on the stages: for the step itself, for the step that it is compared with,
@@ -16,17 +16,17 @@ constexpr int error_order = 12;  // observed order of the error in the step size
 constexpr double step_tolerance = 0.005 * max_relative_error, comparison_tolerance = 0.1 * max_relative_error,
                  guess_tolerance = 1e-4;
 constexpr int max_sweeps = 30;
-constexpr double run_up_fraction = 0.4;   // of the step: integrated first, to extrapolate the rest from it
-constexpr double max_guess_error = 0.03;  // of |y|: with a larger error of the initial guess the step is rejected
+constexpr double run_up_fraction = 0.4;   // part of the step that is integrated first, as a guess for the rest
+constexpr double max_guess_error = 0.03;  // relative to |y|; with a larger error of the guess the step is rejected
 constexpr double predicted_error_factor = 1e-6;  // observed error of such a step, relative to the error of its guess
-constexpr int comparison_points = 41;            // points at which the two steps are compared
+constexpr int comparison_points = 41;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 Collocation::Table::Table(int s)
     : nodes(gauss_nodes(s)),
       at_nodes(legendre_values(nodes, s + 1)),
-      at_places(legendre_values(Vector::LinSpaced(comparison_points, -1.0, 1.0), s + 1)),
-      derivative_matrix(legendre_derivative_matrix(s)) {
+      at_comparison_points(legendre_values(Vector::LinSpaced(comparison_points, -1.0, 1.0), s + 1)),
+      differentiation(legendre_derivative_matrix(s)) {
   Matrix integral = Matrix::Zero(s, s + 1);  // of each polynomial
   integral(0, 0) = integral(0, 1) = 1.0;
   for (int k = 1; k < s; ++k) integral(k, k + 1) = 1.0 / (2 * k + 1), integral(k, k - 1) = -1.0 / (2 * k + 1);
@@ -60,24 +60,25 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
     Vector start(y.size());
     if (!evaluate_rate(t_old, y_, start)) start.setConstant(std::nan(""));
     guess_ = start.replicate(1, few_.nodes.size());
-    collocate(few_, length, guess_tolerance, infinity);
+    solve_stages(few_, length, guess_tolerance, infinity);
   }
   extrapolate_guess(few_, length, span / length);
-  const double guess_error = collocate(few_, span, comparison_tolerance, max_guess_error * size);
+  const double guess_error = solve_stages(few_, span, comparison_tolerance, max_guess_error * size);
   if (!(guess_error <= max_guess_error * size)) {
     error = std::isfinite(guess_error) ? predicted_error_factor * guess_error / size : infinity;
     return;
   }
   few_stage_series_ = series_;
   extrapolate_guess(many_, span, 1.0);
-  collocate(many_, span, step_tolerance, infinity);
-  const double difference = largest_entry(series_ * many_.at_places - few_stage_series_ * few_.at_places);
+  solve_stages(many_, span, step_tolerance, infinity);
+  const double difference =
+      largest_entry(series_ * many_.at_comparison_points - few_stage_series_ * few_.at_comparison_points);
   error = std::isfinite(difference) ? difference / size : infinity;
 }
 
-// Solve for the stages by fixed-point iteration from guess_, into series_. Returns the change of y in the first
-// sweep.
-double Collocation::collocate(const Table& table, double span, double tolerance, double max_first_change) {
+// Solve for the stages by fixed-point iteration from guess_; the solution is series_. Return the change of y in the
+// first sweep.
+double Collocation::solve_stages(const Table& table, double span, double tolerance, double max_first_change) {
   double guess_error = std::nan(""), previous_change = infinity;
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
     integrate(table, span);
@@ -87,7 +88,7 @@ double Collocation::collocate(const Table& table, double span, double tolerance,
     const double sweep_change = largest_entry(rates_ - guess_) * span;
     if (sweep == 0) guess_error = sweep_change;
     guess_ = rates_;
-    // diverging, or converged to rounding
+    // The iteration diverges, or has converged to rounding.
     if (!(sweep_change < 0.5 * previous_change) || guess_error > max_first_change) break;
     if (sweep_change * (sweep ? sweep_change / previous_change : 1.0) <= tolerance) break;
     previous_change = sweep_change;
@@ -115,12 +116,12 @@ void Collocation::evaluate_rates(const Vector& nodes, double span) {
   }
 }
 
-// Extrapolate the rates of series_ to a step that is `ratio` times as long, into guess_.
+// Set guess_ to the rates of series_, extrapolated to a step that is `ratio` times as long.
 void Collocation::extrapolate_guess(const Table& table, double length, double ratio) {
   const Table& table_of_series = series_.cols() == few_.nodes.size() + 1 ? few_ : many_;
   const Vector x = (1 + table.nodes.array()) * ratio - 1;
   guess_ =
-      (2 / length) * (series_ * table_of_series.derivative_matrix) * legendre_values(x, table_of_series.nodes.size());
+      (2 / length) * (series_ * table_of_series.differentiation) * legendre_values(x, table_of_series.nodes.size());
 }
 
 }  // namespace ckc

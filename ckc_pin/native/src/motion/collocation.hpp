@@ -11,18 +11,18 @@ namespace ckc {
 
 class Collocation : public Interpolant {
  public:
-  // numbers of stages are even: an odd one has a stage in the middle
+  // Numbers of stages are even: an odd one has a stage in the middle, at the singular position.
   Collocation(System& system, Work& work, int few_stages = 10, int many_stages = 14);
 
-  // Step from (t, y) over a span whose middle is the singular position. `is_repeat`: the last step started there too
-  // and had about the same span, so it is the initial guess.
+  // Step from (t, y) over a span whose middle is the singular position. `is_repeat`: the last step had the same start
+  // and about the same span, so that it is the initial guess.
   void make_step(double t, In y, double span, bool is_repeat);
   void evaluate(double t, Out y) const;
   bool interpolate(double t, Out y) override { return evaluate(t, y), true; }
-  // Whether the error is small enough. This also shows that the step has stayed on its branch: rates jump between
+  // Whether the error is small enough. A step that has changed its branch is not accurate, because rates jump between
   // branches.
   bool is_accurate() const;
-  // Factor by which the step size could change to just reach the accuracy.
+  // Factor of the step size with which the step would just be accurate.
   double step_scale() const;
 
   double t_old = 0, t = 0;
@@ -34,13 +34,13 @@ class Collocation : public Interpolant {
   struct Table {
     explicit Table(int stages);
     Vector nodes;
-    Matrix at_nodes;     // from a series to its values at the nodes
-    Matrix at_places;    // from a series to its values at the comparison points
-    Matrix integration;  // from values at the nodes to the series of their integral
-    Matrix derivative_matrix;
+    Matrix at_nodes;              // from a series to its values at the nodes
+    Matrix at_comparison_points;  // from a series to its values where two steps are compared
+    Matrix integration;           // from values at the nodes to the series of their integral
+    Matrix differentiation;       // from a series to the series of its derivative
   };
 
-  double collocate(const Table& table, double span, double tolerance, double max_first_change);
+  double solve_stages(const Table& table, double span, double tolerance, double max_first_change);
   void integrate(const Table& table, double span);
   void evaluate_rates(const Vector& nodes, double span);
   void extrapolate_guess(const Table& table, double length, double ratio);

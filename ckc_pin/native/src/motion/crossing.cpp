@@ -7,12 +7,13 @@
 
 namespace ckc {
 
-// Relative to the time to a crossing: how far it may lie behind the end of the run to be passed; how far it may be
-// from the middle of the step; when Newton's method for it, ahead of time, has converged.
+// Relative to the time until a crossing: how far past the end of the run it may be, how far from the middle of the step
+// it may be, and the tolerance of Newton's method for its expected time.
 constexpr double max_time_past_end = 0.3, max_centre_error = 0.04, newton_time_tolerance = 0.01;
-constexpr double max_remaining_singular_value = 0.1;  // of the present singular value: at the extrapolated crossing
+// Singular value at an expected crossing, relative to the present one, above which it is no crossing.
+constexpr double max_remaining_singular_value = 0.1;
 constexpr int max_attempts = 6, max_newton_steps = 10, manifold_checks = 9;
-// bits of accuracy in the search for the smallest singular value
+// Bits of accuracy in the search for the smallest singular value, ahead of the step and within it.
 constexpr int ahead_search_bits = 8, step_search_bits = 24;
 constexpr double rank_lost = RankMonitor::rank_lost, not_found = std::numeric_limits<double>::quiet_NaN();
 
@@ -82,10 +83,10 @@ Crossing::Verdict Crossing::judge_step(const Rank& end, const Rank& after) {
 
 double Crossing::step_over(double time_left, double step_size) {
   double crossed_at = not_found;
-  if (time_left <= std::max(max_distance_, step_size)) {  // a step as long as the last one would not pass it either
+  if (time_left <= std::max(max_distance_, step_size)) {
     const double crossing = step_.t + time_left;
     ++attempts_;
-    if (time_left < 0.5 * step_size)  // J is too ill-conditioned here, so try from the start of the last step
+    if (time_left < 0.5 * step_size)  // J is ill-conditioned here, so try from the start of the last step
       crossed_at = step_from(step_.t_old, step_.y_old, crossing);
     if (!std::isfinite(crossed_at)) crossed_at = step_from(step_.t, step_.y, crossing);
   }
@@ -98,7 +99,7 @@ double Crossing::step_over(double time_left, double step_size) {
   return crossed_at;
 }
 
-// Step from (t, y) with the crossing in the middle. Returns the exact time of the crossing, NaN if the step fails.
+// Step from (t, y) with the crossing in the middle. Return the exact time of the crossing, NaN if the step fails.
 double Crossing::step_from(double t, In y, double crossing) {
   for (int k = 0; k < 2; ++k) {
     const double remaining = crossing - t;
@@ -114,8 +115,8 @@ double Crossing::step_from(double t, In y, double crossing) {
   return not_found;
 }
 
-// Newton's method. With a sign the singular value is smooth at the crossing, so value / rate is the remaining time on
-// both sides.
+// Newton's method. The signed singular value is smooth at the crossing, so value / rate is the remaining time on both
+// sides.
 template <class Motion>
 double Crossing::find_zero(const Motion& motion, double t, double accuracy) {
   double value = std::numeric_limits<double>::infinity();
@@ -134,8 +135,7 @@ double Crossing::find_zero(const Motion& motion, double t, double accuracy) {
   return value <= rank_lost ? t : not_found;
 }
 
-// Whether the step stays on the constraint manifold. If it does not, it may have jumped over a narrow gap between
-// branches.
+// Whether the step stays on the constraint manifold. Otherwise it may have jumped over a narrow gap between branches.
 bool Crossing::is_on_manifold() {
   for (int k = 0; k < manifold_checks; ++k) {
     collocation->evaluate(collocation->t_old + (collocation->t - collocation->t_old) * k / (manifold_checks - 1), y_);

@@ -1,5 +1,5 @@
-// Singular positions, where J loses rank: they are detected within steps and ahead of them. If the formulation
-// allows, a collocation step crosses them. Otherwise they end the run.
+// Detects singular positions, where J loses rank, within steps and ahead of them. A collocation step crosses them if
+// the formulation allows it. Otherwise they end the run.
 #pragma once
 
 #include <memory>
@@ -19,19 +19,20 @@ class Crossing {
            double manifold_tolerance);
 
   void reset();  // after a discontinuity
-  // Announce a time at which J loses rank.
+  // Set a time at which J is known to lose rank.
   void expect_at(double t) { crossing_in_rejected_step_ = t; }
-  // Time until J loses rank, after a step that ended in `end`; NaN if that is not near. Needs no right-hand side.
+  // Time until J loses rank after a step that ended with `end`; NaN if no loss of rank is expected soon. Evaluates no
+  // right-hand side.
   double time_to_crossing(const Rank& end, double step_size, double t_bound);
 
   struct Verdict {
-    double fraction;          // of the step to make: 1 to accept it, less to retry with a shorter one
-    bool rank_lost = false;   // J loses rank within the step, and that cannot be crossed
-    double t = 0, value = 0;  // its time, and the smallest singular value there
+    double fraction;          // 1: accept the step; less: retry with this fraction of it
+    bool rank_lost = false;   // J loses rank within the step, and the position cannot be crossed
+    double t = 0, value = 0;  // of that position: time, smallest singular value
   };
   Verdict judge_step(const Rank& end, const Rank& after);
-  // Step over a crossing. Returns its time, or NaN if it has to be approached first; the method's next step size is
-  // set accordingly.
+  // Step over a crossing and return its time. If it has to be approached first, return NaN and set the next step size
+  // of the method accordingly.
   double step_over(double time_left, double step_size);
   // Call after a step is accepted.
   void accept_step(const Rank& after) {
@@ -42,7 +43,7 @@ class Crossing {
 
  private:
   double step_from(double t, In y, double crossing);
-  // Find the time at which J loses rank on a motion that sets y_, starting from t. NaN if not found.
+  // Find the time near t at which J loses rank along a motion, a function that sets y_. NaN if not found.
   template <class Motion>
   double find_zero(const Motion& motion, double t, double accuracy);
   bool is_on_manifold();
@@ -54,7 +55,7 @@ class Crossing {
   RankMonitor& monitor_;
   double manifold_tolerance_;
   double crossing_in_rejected_step_;  // NaN if there is none
-  double max_distance_;               // s; farther away no collocation step is expected to be accurate
+  double max_distance_;               // s; collocation steps from farther away are not expected to be accurate
   int attempts_ = 0;
   Vector y_;
 };

@@ -7,8 +7,8 @@
 namespace ckc {
 
 constexpr int max_newton_steps = 10;
-constexpr double max_z_step_ratio = 4.0;   // near a singular phi_z, steps of z alone become long
-constexpr double rounding = 2e-16;         // of a product: smaller velocity errors are left as they are
+constexpr double max_z_step_ratio = 4.0;   // of a step of z alone to a minimum-norm step: large near a singular phi_z
+constexpr double rounding = 2e-16;         // relative error of |J v'| that is not corrected
 constexpr double newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
 
 static double largest_entry(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
@@ -35,11 +35,11 @@ void Dae::set_core(In q_tree, bool with_inertia) {
   core_configuration_ = with_inertia ? core.configuration_count : -1;
 }
 
-// Keep the core if it is already there.
+// Does nothing if the core is already at this configuration.
 bool Dae::set_core_configuration(In y) {
   q_tree_ = y.head(core.tree.nq);
   if (!q_tree_.allFinite()) return false;
-  // normalizing again could change the last digit
+  // Compare before normalizing, which could change the last digit again.
   if (core_configuration_ == core.configuration_count && q_tree_ == core.q_tree) return true;
   core.tree.normalize(q_tree_);
   if (core_configuration_ != core.configuration_count || q_tree_ != core.q_tree) set_core(q_tree_);
@@ -50,13 +50,13 @@ bool Dae::motion_rhs(double t, In y, Out y_dot) {
   if (!finite(y)) return fail(RhsFailure::not_finite);
   const auto v = y.tail(core.n);
   v_tree = v;
-  // only the acceleration is needed
+  // Compiled terms give the acceleration without setting the core.
   if (core.compiled && core.joints.locked.empty() && !control.needs_terms() && !is_stabilized()) {
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
-    const bool acts = control.is_active() || core.joints.exerts_force();
-    if (acts && !compute_forces(t, q_tree_, v)) return false;
-    if (core.compiled_acceleration(q_tree_, v, acts ? applied_force(v) : no_force_, zero_correction_,
+    const bool has_force = control.is_active() || core.joints.exerts_force();
+    if (has_force && !compute_forces(t, q_tree_, v)) return false;
+    if (core.compiled_acceleration(q_tree_, v, has_force ? applied_force(v) : no_force_, zero_correction_,
                                    y_dot.tail(core.n))) {
       counts.factorizations += 2;
       core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
@@ -95,7 +95,7 @@ bool Dae::evaluate_rate(double t, In v, Out y_dot) {
   return finite(y_dot) || fail(RhsFailure::not_finite);
 }
 
-// Derivatives with respect to the numbers of q'; a quaternion stands for the rotation of its normalized value.
+// Derivatives with respect to the entries of q'. The rotation of a quaternion is that of its normalized value.
 bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const int n = core.n, nq = core.tree.nq;
   if (!finite(y)) return false;
@@ -113,7 +113,7 @@ bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if (!acceleration_derivatives(q_tree_, v, residual_)) return System::motion_jacobian(t, y, jacobian, evaluations);
   if (is_stabilized() && core.constraints.closure.rows) {
     DynamicsDerivatives& by = core.derivatives;
-    by.compute(q_tree_, v, eq_1_.a, zero_correction_);  // for the constraint rows; compiled terms do not compute these
+    by.compute(q_tree_, v, eq_1_.a, zero_correction_);  // of the constraint rows, which compiled terms do not compute
     const Matrix none = Matrix::Zero(n, n);
     if (!core.solve_acceleration_derivatives(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, stabilization_))
       return false;
@@ -137,8 +137,8 @@ bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   return finite(jacobian.reshaped());
 }
 
-// A stiff controller would respond to changes of the measured q. With a controller, only z is corrected, unless that
-// takes much longer steps.
+// A stiff controller would respond to a correction of the measured q. With a controller, only z is corrected, unless
+// that takes much longer steps.
 bool Dae::closure_step(In residual) {
   if (!core.closure_step(residual, step_)) return false;
   if (!control.is_active()) return true;
@@ -159,7 +159,7 @@ bool Dae::project_onto_manifold(In y) {
     residual_.noalias() = core.constraints.J * step_;
     core.tree.integrate(q_tree_, step_);
     set_core(q_tree_);
-    if (largest_entry(residual_) <= tolerance) break;  // the remaining residual is a contradiction of redundant rows
+    if (largest_entry(residual_) <= tolerance) break;  // redundant rows that contradict each other keep phi large
   }
   velocity = velocity_in(y);
   residual_.noalias() = core.constraints.J * velocity;
@@ -179,7 +179,7 @@ bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
     ++counts.factorizations;
     core.tree.integrate(q_tree_, step_);
     set_core(q_tree_);
-    // the remaining error is the square of this step
+    // Newton's method converges quadratically: the remaining error is the square of this step.
     if (largest_entry(step_.cwiseQuotient(core.scales.columns)) <= newton_tolerance) break;
   }
   residual_.noalias() = core.constraints.J * velocity_in(y);
@@ -194,8 +194,8 @@ void Dae::rate_pairs(std::vector<std::pair<int, int>>& of) const {
   for (int k : core.tree.single_dof) of.emplace_back(core.tree.q_index[k], core.tree.nq + k);
 }
 
-// Restrict the Jacobian to the tangent space: no motion crosses the constraint manifold, whatever the Jacobian says
-// there.
+// Restrict the Jacobian to the tangent space. Its other eigenvalues belong to motions off the constraint manifold,
+// which do not occur.
 bool Dae::reduce_to_freedoms(In y, Matrix& jacobian) {
   const int n = core.n, nq = core.tree.nq, d = n - core.rank;
   set_core_configuration(y);
@@ -248,12 +248,11 @@ bool Dae::sync_core_unprojected(double, In y) {
   return true;
 }
 
-bool Dae::read_from_state(In y, int k, bool evaluate_rate, double& value) const {
+bool Dae::read_from_state(In y, int k, bool of_rate, double& value) const {
   const int nq = core.tree.nq;
-  if (!evaluate_rate && nq != core.n &&
-      !std::binary_search(core.tree.single_dof.begin(), core.tree.single_dof.end(), k))
+  if (!of_rate && nq != core.n && !std::binary_search(core.tree.single_dof.begin(), core.tree.single_dof.end(), k))
     return false;
-  return value = y(evaluate_rate ? nq + k : core.tree.q_index[k]), true;
+  return value = y(of_rate ? nq + k : core.tree.q_index[k]), true;
 }
 
 void Dae::write_projected_state(Out y) const {

@@ -16,7 +16,7 @@ class Dae : public System {
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
   bool sync_core_unprojected(double t, In y) override;
-  bool read_from_state(In y, int k, bool evaluate_rate, double& value) const override;
+  bool read_from_state(In y, int k, bool of_rate, double& value) const override;
   void write_projected_state(Out y) const override;
   bool set_core_configuration(In y) override;
   Accepted accept_step(double t, Out y, double margin) override;
@@ -34,20 +34,20 @@ class Dae : public System {
   bool motion_rhs(double t, In y, Out y_dot) override;
   bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   Eigen::Ref<const Vector> velocity_in(In y) const { return y.segment(core.tree.nq, core.n); }
-  void set_core(In q_tree, bool with_inertia = true);  // and compute J
+  void set_core(In q_tree, bool with_inertia = true);  // to a configuration, with J
   void set_q_and_q_dot(In q_tree, In v);
-  bool compute_forces(double t, In q_tree, In v);  // applied forces at this state
+  bool compute_forces(double t, In q_tree, In v);  // evaluates the control
   bool is_stabilized() const { return alpha_ != 0.0 || beta_ != 0.0; }
   bool evaluate_rate(double t, In v, Out y_dot);  // at the core's configuration
-  // Project y; the result is in core.q_tree and velocity. Without control, corrections are minimum-norm in the metric
-  // of the inertia, which changes the motion least.
+  // Project y; the result is core.q_tree and `velocity`. Without control, corrections are minimum-norm in the metric of
+  // the inertia, which disturbs the motion as little as possible.
   bool project_onto_manifold(In y);
-  bool closure_step(In residual);  // into step_
+  bool closure_step(In residual);  // sets step_
 
   const double tolerance_, alpha_, beta_;
   const bool projects_;
-  long core_configuration_ = -1;  // core.configuration_count after this object has set the core
-  Vector q_tree_;  // configuration of the last right-hand side
+  long core_configuration_ = -1;  // core.configuration_count when this object last set the core; -1: without inertia
+  Vector q_tree_;                 // configuration of the last right-hand side
   Vector step_, z_step_, residual_, no_force_;
   Matrix stabilization_;
 };

@@ -4,7 +4,7 @@
 
 namespace ckc {
 
-constexpr double rounding = 1e-13;  // of kinetic and potential energy
+constexpr double rounding = 1e-13;  // of the energy, relative to |kinetic| + |potential|
 
 double EnergyMonitor::energy(System& system) {
   Core& core = system.core;
@@ -17,8 +17,8 @@ double EnergyMonitor::energy(System& system) {
 
 void EnergyMonitor::start_step(System& system) { start_energy_ = end_energy_ = energy(system); }
 
-// A state within its tolerance has errors atol + rtol |x|. The energy then has that error times its gradient: the
-// momentum, and the forces, which here include C'v'.
+// A state within its tolerance has errors atol + rtol |x|. The energy then has these errors times its gradient: the
+// momentum and the bias forces.
 double EnergyMonitor::relative_change(System& system, double rtol, double atol) {
   end_energy_ = energy(system);
   if (std::isnan(start_energy_) || std::isnan(end_energy_)) return 0.0;

@@ -1,4 +1,4 @@
-// Checks the energy change of a step of a conservative motion.
+// Checks the energy change of each step of a conservative motion.
 #pragma once
 
 #include <cmath>
@@ -12,14 +12,14 @@ class EnergyMonitor {
   explicit EnergyMonitor(const Core& core) { momentum_.setZero(core.n); }
   // Store the energy at the start of a step, at the core's state.
   void start_step(System& system);
-  // Energy change of a step to the core's state, relative to what the tolerances `rtol` and `atol` allow. Zero if the
-  // motion is not conservative.
+  // Energy change of a step to the core's state, relative to the change that errors within `rtol` and `atol` cause.
+  // Zero if the motion is not conservative.
   double relative_change(System& system, double rtol, double atol);
   void accept_step() { start_energy_ = end_energy_; }
   double change = 0.0;  // J, of the last step
 
  private:
-  double energy(System& system);  // also computes momentum_
+  double energy(System& system);  // sets momentum_ and size_ too; NaN if the motion is not conservative
   double start_energy_ = std::nan(""), end_energy_ = std::nan(""), size_ = 0.0;
   Vector momentum_;
 };

@@ -6,8 +6,8 @@
 namespace ckc {
 
 constexpr double coordinate_rounding = 1e-15;  // rad, or relative to the mechanism's size
-constexpr double min_known_rate = 1e-9;        // rad/s, m/s: smaller rates at the start of a motion count as zero
-constexpr double simultaneous_time_tolerance = 2e-12;  // s: computed times of simultaneous events differ by less
+constexpr double min_nonzero_rate = 1e-9;      // rad/s, m/s; smaller rates at the start of a motion count as zero
+constexpr double simultaneous_time_tolerance = 2e-12;  // s; computed times of simultaneous events differ by less
 
 Events::Events(System& system, Step& step, std::vector<Event> events)
     : system_(system), step_(step), events_(std::move(events)), sample_points_(sample_points()) {
@@ -43,8 +43,8 @@ void Events::reset() {
   restart();
 }
 
-// A small offset of a joint at the start of its motion counts as zero, since events are located with a tolerance. A
-// joint that is off its stop is known to be off it, however close it is.
+// A small rate of a joint at the start of its motion counts as zero, since events are located with a tolerance. An
+// offset from a stop is exact, however small it is.
 void Events::monitor_joints(In coordinates, In velocity, double time_tolerance) {
   const Joints& joints = system_.core.joints;
   joint_events.clear();
@@ -66,7 +66,7 @@ void Events::monitor_joints(In coordinates, In velocity, double time_tolerance) 
       signs_[i] = 1, active_[i] = !joints.locked.empty();
     }
     event.zero_threshold =
-        offset * signs_[i] > (event.quantity == Event::q ? 0.0 : min_known_rate) ? 0.0 : 2.0 * std::abs(offset);
+        offset * signs_[i] > (event.quantity == Event::q ? 0.0 : min_nonzero_rate) ? 0.0 : 2.0 * std::abs(offset);
     // Rounding of its rate may move a joint into its stop before it leaves.
     if (event.quantity == Event::q)
       event.zero_threshold = std::max(event.zero_threshold, coordinate_rounding * joints.table.reach(k));
@@ -115,7 +115,7 @@ bool Events::set_core(double t, CoreAccuracy required) {
   if (required == unprojected) return system_.sync_core_unprojected(t, y_);
   if (!system_.sync_core(t, y_)) return false;
   bool changed = required == joints_at_rest && !system_.core.joints.locked.empty();
-  for (int k = 0; k < 2 && changed; ++k)  // moving a joint to its position changes rates, so repeat once
+  for (int k = 0; k < 2 && changed; ++k)  // correcting positions changes rates, so repeat once
     if (!system_.correct_locked_joints(y_, 0.0, changed) || !system_.sync_core(t, y_)) return false;
   return true;
 }
@@ -172,13 +172,13 @@ void Events::end_step() {
 bool Events::sample_values(Interpolant& motion, Eigen::Index first, Eigen::Index stride) {
   const double h = step_.t_new - step_.t;
   for (Eigen::Index i = first; i < sample_points_.size(); i += stride) {
-    const bool ends = i + 1 == sample_points_.size();
-    const double t = ends ? step_.t_new : step_.t + h * sample_points_(i);
+    const bool is_end = i + 1 == sample_points_.size();
+    const double t = is_end ? step_.t_new : step_.t + h * sample_points_(i);
     if (!set_state(motion, t)) return false;
     for (int k : to_search_) {
       double known_value = std::numeric_limits<double>::quiet_NaN();
       if (i == 0 && last_values_time_ == step_.t) known_value = last_values_[k];
-      if (ends && events_[k].quantity == Event::holding_margin) known_value = end_holding_margin_;
+      if (is_end && events_[k].quantity == Event::holding_margin) known_value = end_holding_margin_;
       if (!std::isnan(known_value))
         values_(i, k) = known_value;
       else if (!event_value(k, t, values_(i, k)))
@@ -188,8 +188,7 @@ bool Events::sample_values(Interpolant& motion, Eigen::Index first, Eigen::Index
   return true;
 }
 
-// For a coordinate or rate known at both ends of the step: whether it starts on the side where it was. An impact may
-// move a rate across its value.
+// Whether a coordinate or rate starts the step with its previous sign. An impact may move a rate across its value.
 bool Events::continues_on_same_side(int k) const {
   const Event& event = events_[k];
   const double offset = (event.quantity == Event::q ? start_.q : start_.v)(event.coordinate) - event.value;
@@ -199,7 +198,7 @@ bool Events::continues_on_same_side(int k) const {
 bool Events::find_events(Interpolant& motion, bool last, bool joints_only, double& stop_time) {
   stop_time = std::numeric_limits<double>::infinity();
   if (events_.empty()) return true;
-  to_search_.clear(), sampled_.clear(), found_.clear();
+  to_search_.clear(), sampled_.clear(), new_occurrences_.clear();
   for (int k = 0; k < static_cast<int>(events_.size()); ++k) {
     const Event& event = events_[k];
     if (!active_[k] || (joints_only && !event.is_joint_event)) continue;
@@ -212,17 +211,19 @@ bool Events::find_events(Interpolant& motion, bool last, bool joints_only, doubl
     }
   }
   if (!to_search_.empty()) {
-    const bool locked = std::any_of(to_search_.begin(), to_search_.end(),
-                                    [&](int k) { return events_[k].quantity == Event::holding_margin; });
-    if (!sample_values(motion, 0, locked ? 2 : 1)) return false;
+    const bool searches_holding_margin = std::any_of(
+        to_search_.begin(), to_search_.end(), [&](int k) { return events_[k].quantity == Event::holding_margin; });
+    if (!sample_values(motion, 0, searches_holding_margin ? 2 : 1)) return false;
     sampled_ = to_search_;
     to_search_.erase(
         std::remove_if(to_search_.begin(), to_search_.end(), [&](int k) { return joints_hold_throughout(k); }),
         to_search_.end());
-    if (!to_search_.empty() && !((!locked || sample_values(motion, 1, 2)) && search_step(motion, last, stop_time)))
-      return false;
+    if (!to_search_.empty()) {
+      if (searches_holding_margin && !sample_values(motion, 1, 2)) return false;
+      if (!search_step(motion, last, stop_time)) return false;
+    }
   }
-  if (!to_search_.empty() || !found_.empty()) report_occurrences(stop_time);
+  if (!to_search_.empty() || !new_occurrences_.empty()) report_occurrences(stop_time);
   joints_changed_ = joints_changed_ && joints_only;
   last_values_time_ = step_.t_new;
   std::fill(last_values_.begin(), last_values_.end(), std::numeric_limits<double>::quiet_NaN());
@@ -239,9 +240,9 @@ bool Events::find_events(Interpolant& motion, bool last, bool joints_only, doubl
 bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
   const bool resting = !system_.core.joints.locked.empty();
   for (int k : to_search_) {
-    const auto value_at = [&](double t, double& there) { return set_state(motion, t) && event_value(k, t, there); };
-    const auto exact_at = [&](double t, double& there) { return set_state(motion, t) && exact_value(k, t, there); };
-    const ScalarFunction value = std::cref(value_at), exact = std::cref(exact_at);  // references, to avoid allocations
+    const auto value_at = [&](double t, double& result) { return set_state(motion, t) && event_value(k, t, result); };
+    const auto exact_at = [&](double t, double& result) { return set_state(motion, t) && exact_value(k, t, result); };
+    const ScalarFunction value = std::cref(value_at), exact = std::cref(exact_at);  // references avoid allocations
     const Event& event = events_[k];
     const bool has_cheap_value = event.quantity <= Event::q_dot || event.quantity == Event::holding_margin;
     RootSearch& search = searches_[k];
@@ -249,8 +250,7 @@ bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
     if (!event.is_joint_event) {
       largest_[k] = std::max(largest_[k], values_.col(k).cwiseAbs().maxCoeff());
       if (event.quantity == Event::function && resting) zero_threshold = function_rounding * std::max(1.0, largest_[k]);
-      // A function that was on zero until joints changed, or has just reached it, counts as zero where the step
-      // begins.
+      // A function that was zero until the joint modes changed, or has just reached zero, counts as zero at the start.
       const double first = std::abs(values_(0, k));
       const bool was_zero = signs_[k] ? has_just_crossed(k) : resting_[k] != 0;
       if (joints_changed_ && was_zero && first <= relative_zero_tolerance * largest_[k])
@@ -268,7 +268,7 @@ bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
       search.sign_changes.emplace_back(step_.t_new, -search.sign);
     for (const auto& [t, direction] : search.sign_changes) {
       if (event.direction != 0 && event.direction != direction) continue;
-      found_.push_back({t, k, direction});
+      new_occurrences_.push_back({t, k, direction});
       if (event.stop) stop_time = std::min(stop_time, t);
     }
   }
@@ -276,17 +276,18 @@ bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
 }
 
 // Report the events up to the stop. If joint modes change at that time, events a rounding error later belong to the
-// same instant: the motion behind it is never made.
+// same instant, because the motion continues differently from there.
 void Events::report_occurrences(double stop_time) {
-  std::sort(found_.begin(), found_.end(), [](const EventOccurrence& a, const EventOccurrence& b) {
+  std::sort(new_occurrences_.begin(), new_occurrences_.end(), [](const EventOccurrence& a, const EventOccurrence& b) {
     return a.t != b.t ? a.t < b.t : a.event < b.event;
   });
   joint_events.clear(), stopped_ = false;
-  const bool changes = std::any_of(found_.begin(), found_.end(), [&](const EventOccurrence& occurrence) {
+  const auto changes_modes = [&](const EventOccurrence& occurrence) {
     return occurrence.t == stop_time && events_[occurrence.event].is_joint_event;
-  });
-  const double until = changes ? stop_time + simultaneous_time_tolerance : stop_time;
-  for (const EventOccurrence& occurrence : found_) {
+  };
+  const bool modes_change = std::any_of(new_occurrences_.begin(), new_occurrences_.end(), changes_modes);
+  const double until = modes_change ? stop_time + simultaneous_time_tolerance : stop_time;
+  for (const EventOccurrence& occurrence : new_occurrences_) {
     const Event& event = events_[occurrence.event];
     if (occurrence.t > (event.is_joint_event ? stop_time : until)) continue;
     if (event.is_joint_event)

@@ -19,13 +19,13 @@ struct Event {
   enum Quantity { q, q_dot, sigma_min_phi_z, sigma_min_J, function, holding_margin };
   Quantity quantity;
   int coordinate = 0;
-  double value = 0.0, sign = 1.0;  // crosses zero where sign * (quantity - value) does
+  double value = 0.0, sign = 1.0;  // the event's function is sign * (quantity - value)
   int direction = 0;               // 1: rising, -1: falling, 0: both
-  bool stop = false;
-  double zero_threshold = 0.0;  // smaller values count as zero
-  // for user functions: compute the value at (t, state of the core); false if an exception was raised
+  bool stop = false;               // whether it stops the loop
+  double zero_threshold = 0.0;     // smaller values count as zero
+  // Evaluate a user's function at (t, state of the core). False if it raised an exception.
   std::function<bool(double, System&, double&)> evaluate;
-  // of the loop itself: a joint comes to rest, reaches a stop, or exceeds its holding force
+  // Not a user's event: a joint comes to rest, reaches a stop, or exceeds its holding force.
   bool is_joint_event = false;
 };
 
@@ -34,9 +34,9 @@ struct EventOccurrence {
   int event, direction;
 };
 
-// of the largest value of a function: errors of this size come from the solver's tolerances
+// Error of a function that is due to the solver's tolerances, relative to its largest value.
 constexpr double relative_zero_tolerance = 1e-7;
-// of max(1, largest value): rounding of a function while joints are at rest
+// Rounding of a function while joints are at rest, relative to max(1, largest value).
 constexpr double function_rounding = 1e-12;
 
 using Points = std::vector<std::pair<double, double>>;  // (t, value), sorted by t
@@ -54,9 +54,9 @@ struct Interval {
 // Finds the sign changes of a function within a step. The object keeps the results, and reuses its workspace.
 struct RootSearch {
   std::vector<std::pair<double, int>> sign_changes;  // (t, direction), sorted
-  int sign = 0;                                      // last nonzero sign in the step, 0 if there was none
-  bool on_zero = false;                              // at the end of the step
-  bool always_on_zero = false;                       // throughout the step
+  int sign = 0;                                      // last nonzero sign, 0 if there was none
+  bool on_zero = false;                              // whether the function is zero at the end of the step
+  bool always_on_zero = false;                       // whether it is zero throughout the step
 
   // `values`: at the sample points. `sign_before`: before the step. `zero_threshold`: smaller values count as zero.
   // `exact`: the exact function, if `function` is a cheap approximation. False if the function has no value somewhere.
@@ -81,22 +81,22 @@ class Events {
   // ends with this step. `joints_only`: ignore the user's events. False if a function has no value: `failed`, or the
   // control's failure, tells which.
   bool find_events(Interpolant& motion, bool last, bool joints_only, double& stop_time);
-  // Determine the sign of each event that has none yet, at (t, y), before joint modes change: a jump across the value
-  // can then be detected. False if a function has no value.
-  bool learn_signs_before_change(double t, In y);
-  // Monitor the joints in their present modes, from these coordinates and velocities on. `time_tolerance`: of
-  // the present time, s.
+  // Determine the sign of each event that has none yet, at (t, y), before a transition of joint modes. A jump across
+  // the value can then be detected. False if a function has no value.
+  bool determine_signs_before_transition(double t, In y);
+  // Monitor the joints in their present modes, starting from these coordinates and velocities. `time_tolerance`: of the
+  // present time, s.
   void monitor_joints(In coordinates, In velocity, double time_tolerance);
 
   std::vector<EventOccurrence> occurrences;
-  std::vector<Event> joint_events;  // joint events at the time of the last stop
-  int failed = -1;
+  std::vector<Event> joint_events;  // joint events that triggered the last stop
+  int failed = -1;                  // event whose function has no finite value, else -1
   double failed_value = 0.0;
   bool is_empty() const { return events_.empty(); }
   bool stopped() const { return stopped_; }  // whether the last stop was due to a user's event
 
  private:
-  struct End {  // end of a step: quantities known there without interpolation
+  struct End {  // state at an end of the step, as the right-hand side left it
     Vector q, v, a;
     bool has_acceleration = false;
   };
@@ -111,7 +111,7 @@ class Events {
   bool exact_value(int k, double t, double& value);
   bool value_at_core(int k, double t, double& value);  // the core is at y_
   bool set_state(Interpolant& motion, double t);
-  bool set_core(double t, CoreAccuracy required);  // set the core to y_
+  bool set_core(double t, CoreAccuracy required);  // to y_
   void record_end(End& end, In f);
   double holding_margin() const;  // at the last evaluated right-hand side
   bool sample_values(Interpolant& motion, Eigen::Index first, Eigen::Index stride);
@@ -138,23 +138,24 @@ class Events {
   System& system_;
   Step& step_;
   std::vector<Event> events_;
-  std::vector<int> signs_, to_search_, sampled_;  // by event; events to search; events with sampled values
-  std::vector<char> active_;
+  std::vector<int> signs_;       // by event: last nonzero sign of its function, 0 if unknown
+  std::vector<char> active_;     // by event: whether it can occur in the present joint modes
+  Indices to_search_, sampled_;  // events to search in this step; events whose values were sampled
   const Vector& sample_points_;
   End start_, end_;
   std::vector<double> crossed_at_;      // by event: time of its last sign change, s; NaN if there is none
   std::vector<double> largest_;         // by event: largest |value| in this motion
   std::vector<char> resting_;           // by event: whether it has reached its value and stayed there
-  bool joints_changed_ = false;         // at the start of the next step
-  double change_time_tolerance_ = 0.0;  // s: tolerance of that time
+  bool joints_changed_ = false;         // whether joint modes changed at the start of the next step
+  double change_time_tolerance_ = 0.0;  // s, of the time of that transition
   bool stopped_ = false;
-  bool start_is_known_ = false;      // whether start_ belongs to this step
-  double end_holding_margin_ = 0.0;  // at the end of the step, NaN if unknown
-  double last_values_time_ = 0.0;
-  std::vector<double> last_values_;   // values at the end of the last step; NaN if not evaluated
-  Matrix values_;                     // (sample points, events)
-  std::vector<RootSearch> searches_;  // by event
-  std::vector<EventOccurrence> found_;
+  bool start_is_known_ = false;                   // whether start_ belongs to this step
+  double end_holding_margin_ = 0.0;               // at the end of the step, NaN if unknown
+  double last_values_time_ = 0.0;                 // s, end of the last step
+  std::vector<double> last_values_;               // by event: value at that time, NaN if not evaluated
+  Matrix values_;                                 // (sample points, events)
+  std::vector<RootSearch> searches_;              // by event
+  std::vector<EventOccurrence> new_occurrences_;  // in this step
   Vector y_, coordinates_;
   CoreAccuracy core_accuracy_ = not_set;  // at y_
   Eigen::JacobiSVD<Matrix> svd_J_, svd_phi_z_;

@@ -8,13 +8,13 @@
 
 namespace ckc {
 
-constexpr double rest_tolerance = 1e-9;       // rad, m and their rates: smaller values may be rounding
-constexpr double max_relative_rate = 1e-4;    // of the fastest joint: faster joints can move and need no further check
-constexpr double mobility_threshold = 1e-10;  // of the response that the joint would have without loops
+constexpr double rest_tolerance = 1e-9;       // rad, m and their rates; smaller values may be rounding
+constexpr double max_relative_rate = 1e-4;    // relative to the fastest joint; faster joints are moving
+constexpr double mobility_threshold = 1e-10;  // relative to the response that the joint would have without loops
 
-// A function on its value has no sign, so rounding must not assign one. A function that crossed its value in the step
-// that ends here, and is still zero within the tolerances, crosses here.
-bool Events::learn_signs_before_change(double t, In y) {
+// A function that is zero has no sign, so rounding must not assign one. A function that crossed zero in the step that
+// ends here, and is still zero within the tolerances, crosses here.
+bool Events::determine_signs_before_transition(double t, In y) {
   const Vector& reach = system_.core.joints.table.reach;
   y_ = y, core_accuracy_ = not_set;
   for (int k = 0; k < static_cast<int>(events_.size()); ++k) {
@@ -51,7 +51,7 @@ void Events::report_arrival(int k, int sign, double& stop_time) {
   if (!sign && has_just_crossed(k)) return;  // the crossing was found in the previous step
   crossed_at_[k] = step_.t;
   if (event.direction && event.direction != direction) return;
-  found_.push_back({step_.t, k, direction});
+  new_occurrences_.push_back({step_.t, k, direction});
   if (event.stop) stop_time = std::min(stop_time, step_.t);
 }
 
@@ -97,17 +97,17 @@ bool Events::can_move(int coordinate, double t, In y) {
   const auto m = static_cast<Eigen::Index>(coordinates.size()), last = m - 1;
   Vector scale(m);
   for (Eigen::Index i = 0; i < m; ++i) scale(i) = std::sqrt(core.joint_inertia(coordinates[i]));
-  Matrix A(m, m);  // relative to the responses without loops
+  Matrix A(m, m);  // responses, relative to those without loops
   for (Eigen::Index i = 0; i < m; ++i)
     for (Eigen::Index j = 0; j < m; ++j) A(i, j) = scale(i) * scale(j) * responses_(coordinates[i], j);
-  double moves = A(last, last);
+  double response = A(last, last);
   if (last) {
     Eigen::CompleteOrthogonalDecomposition<Matrix> held(last, last);
     held.setThreshold(mobility_threshold);
     held.compute(A.topLeftCorner(last, last));
-    moves -= A.row(last).head(last).dot(held.solve(A.col(last).head(last)));
+    response -= A.row(last).head(last).dot(held.solve(A.col(last).head(last)));
   }
-  return moves > mobility_threshold;
+  return response > mobility_threshold;
 }
 
 }  // namespace ckc

@@ -6,8 +6,9 @@
 
 namespace ckc {
 
-constexpr double interpolation_error_factor = 3.0;  // times the difference of two interpolations of different order
-constexpr double min_range_ratio = 0.1;             // of the function's range in the step: required distance from zero
+// Required distance from zero: a multiple of the difference between two interpolations of different order, and a
+// fraction of the function's range in the step.
+constexpr double interpolation_error_factor = 3.0, min_range_ratio = 0.1;
 
 // Whether a coordinate or rate stays away from its value throughout the step. Uses Hermite interpolation of the ends
 // with and without accelerations; their difference estimates the error.

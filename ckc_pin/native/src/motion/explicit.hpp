@@ -17,7 +17,7 @@ class Explicit : public Method {
   void reset_history() override { growth_pending_ = false; }
   const char* name() const override { return kind_ == dop853 ? "DOP853" : "RK45"; }
   int error_order() const override { return kind_ == dop853 ? 7 : 4; }
-  // Estimated step size of RK45, from the last step's error.
+  // Step size of RK45, estimated from the error of the last step.
   double order_five_step_size() const { return order_five_step_; }
 
  private:
@@ -29,11 +29,13 @@ class Explicit : public Method {
   int stages_;
   Matrix A_, A_extra_, D_;  // D_: dense output
   Vector B_, C_, C_extra_, E_[2];
-  Matrix K_, F_;  // (size, stages), (size, powers)
-  Matrix X_;      // rates of the full motion, (full motion size, stages)
-  Vector y_stage_, scale_, error_;
-  Vector x_stage_;
-  bool has_dense_output_ = false, growth_pending_ = false, growth_next_ = false;
+  Matrix K_;  // rates at the stages, (size, stages)
+  Matrix F_;  // coefficients of the dense output, (size, powers)
+  Matrix X_;  // rates of the full motion at the stages, (full motion size, stages)
+  Vector y_stage_, x_stage_, scale_, error_;
+  bool has_dense_output_ = false;
+  // Whether the last accepted step, and the new one, ask for a growth of more than max_single_growth.
+  bool growth_pending_ = false, growth_next_ = false;
   double order_five_step_ = 0.0;
 };
 

@@ -13,9 +13,9 @@ namespace ckc {
 // Only an elastic body between two others whose masses differ by more than a factor of 1e6 needs more rounds. The
 // final projection on the cone of all stops ends them.
 constexpr long max_rounds = 4000;
-constexpr int max_final_projections = 3;        // that end an impact
-constexpr double reflection_tolerance = 1e-10;  // relative difference of gap rates
-constexpr double min_relative_force = 1e-6;     // of the largest force: below it a stop does not take part
+constexpr int max_final_projections = 3;
+constexpr double reflection_tolerance = 1e-10;  // relative rounding of a reflected gap rate
+constexpr double min_relative_force = 1e-6;     // of a jammed stop, relative to the largest force
 
 namespace {
 
@@ -58,8 +58,9 @@ class ImpactSolver {
     if (values(0) <= dependent_row_tolerance * values(m_ - 1)) find_jammed_stops();
   }
 
-  // Find stops that push against each other, so that none can be left: forces y >= 0 with A y = 0. They have no
-  // restitution. Each quadratic program looks for y with a force on stops that are not yet known to be jammed.
+  // Find jammed stops, which push against each other so that no joint can leave its stop: there are forces y >= 0 with
+  // A y = 0. They have no restitution. Each quadratic program finds forces on stops that are not yet known to be
+  // jammed.
   void find_jammed_stops() {
     const Vector low = Vector::Zero(m_), high = Vector::Constant(m_, infinity);
     for (Eigen::Index attempt = 0; attempt < m_; ++attempt) {
@@ -108,15 +109,15 @@ class ImpactSolver {
       gap_rates_ += impulse * A_.col(stops_[i]);
       impulses_(stops_[i]) = impulse * scale_(stops_[i]);
     }
-    for (Eigen::Index i = 0; i < count; ++i) {  // use the exact value where only rounding differs
+    for (Eigen::Index i = 0; i < count; ++i) {  // remove the rounding of reflected rates
       const double reflected = -restitution * gap_rates(i);
       if (std::abs(gap_rates_(stops_[i]) - reflected) <= reflection_tolerance * size) gap_rates_(stops_[i]) = reflected;
     }
     return apply_(stops_, impulses_, restitution);
   }
 
-  // Stop what still approaches, and remove bounces that are too slow, by a projection on one cone. Resting stops are
-  // held for it: otherwise releasing one and removing the bounce of another could alternate forever.
+  // Stop joints that still approach, and remove bounces that are too slow, by a projection on one cone. Joints that
+  // rest at their stops are held: otherwise releasing one and removing the bounce of another could alternate forever.
   bool finish() {
     for (int attempt = 0; attempt < max_final_projections; ++attempt) {
       stops_.clear();

@@ -21,7 +21,7 @@ struct ImpactProblem {
   Matrix A;                 // (m, m), positive semidefinite, with a positive diagonal
   Vector gap_rates;         // (m), before the impact
   Vector restitution;       // (m), from 0 to 1
-  Vector rest_speed;        // (m): a stop rests if |gap rate| is not larger
+  Vector rest_speed;        // (m): a joint rests at its stop if |gap rate| is not larger
   Vector min_bounce_speed;  // (m): slower bounces are suppressed
 };
 
@@ -29,8 +29,8 @@ struct ImpactProblem {
 // are not negative, unless they remove a slow bounce.
 using ImpactRound = std::function<bool(const Indices& stops, const Vector& impulses, double restitution)>;
 
-// Compute the gap rates after the impact, (m), zero where a stop rests. False if a quadratic program fails or `round`
-// returns false.
+// Compute the gap rates after the impact, (m), zero where a joint rests at its stop. False if a quadratic program fails
+// or `round` returns false.
 bool resolve_impact(const ImpactProblem& problem, const ImpactRound& round, Vector& gap_rates);
 
 }  // namespace ckc

@@ -1,4 +1,4 @@
-// Quantities that are integrated along with a motion and do not act on it: its sensitivities.
+// Quantities that are integrated along with a motion and do not influence it, such as its sensitivities.
 #pragma once
 
 #include <utility>
@@ -7,15 +7,16 @@
 
 namespace ckc {
 
-// A coordinate, or its rate, that arrives at a value where joint modes change.
+// A coordinate arrives at a stop, or its rate at zero, so that joint modes change.
 struct JointArrival {
   int coordinate;
   bool of_rate;
-  int stop = 0;  // at which the coordinate arrives, -1 for the lower one; its position may depend on parameters
+  int stop = 0;  // side of the stop, -1 for the lower one; 0: none
 };
 
-// The last entries of y, in columns whose Jacobians with respect to themselves are equal. The step loop owns the
-// integrand, and the formulation (motion/system.hpp) appends its rates. Arguments `y` and `y_dot` have all entries.
+// The last entries of y. They form columns of equal size, and the Jacobian of each column's rate with respect to the
+// column is the same. The step loop owns the integrand, and the formulation (motion/system.hpp) appends its rates.
+// Arguments `y` and `y_dot` have all entries.
 class Integrand {
  public:
   virtual ~Integrand() = default;
@@ -46,8 +47,8 @@ class Integrand {
   // to restart. False, with a reason in `System::failure`, if a derivative is unknown.
   virtual bool control_sampled(In y, bool& changed) = 0;
 
-  virtual int record_size() const = 0;  // numbers in a row of the record
-  // Fill them where the core is at y, with its control evaluated.
+  virtual int record_size() const = 0;  // columns in a row of the record
+  // Fill them; the core is at y, and its control has been evaluated.
   virtual void fill_record(In y, Out row) = 0;
 };
 

@@ -12,15 +12,16 @@
 namespace ckc {
 
 constexpr double infinity = std::numeric_limits<double>::infinity();
-// of the largest velocity: below it a joint is at rest; rad, or relative to the size: below it a joint is at a stop
+// Rounding of rates, relative to the largest; of coordinates in rad, or relative to the mechanism's size.
 constexpr double rate_rounding = 1e-11;
-// of the largest force: reduction of the bounds after a holding force was exceeded
+// Reduction of the force bounds after a holding force was exceeded, relative to the largest force.
 constexpr double holding_reduction = 1e-6;
-constexpr double min_mobility = 1e-12;  // of a joint's response without loops: below it the loops block the joint
-// of the acceleration that friction alone would cause
+// Response of a joint, relative to its response without loops, below which the loops block it.
+constexpr double min_mobility = 1e-12;
+// Relative to the acceleration that friction alone would cause: smallest scale of accelerations, and their rounding.
 constexpr double friction_scale_factor = 1e-6, friction_rounding_factor = 1e-8;
-constexpr double stop_offset_factor = 4.0;       // times the distance of a joint from its stop
-constexpr double acceleration_tolerance = 1e-9;  // of the largest acceleration: below it zero
+constexpr double stop_offset_factor = 4.0;  // smallest rise of a bounce, relative to the joint's distance from its stop
+constexpr double acceleration_tolerance = 1e-9;  // relative to the largest acceleration
 
 static bool contains(const Indices& list, int k) { return std::find(list.begin(), list.end(), k) != list.end(); }
 
@@ -78,14 +79,14 @@ bool JointModeTransitions::update(double t, Out y, const std::vector<Event>& tri
   joints_.rate_rounding = rate_rounding * v_.cwiseQuotient(reach).lpNorm<Eigen::Infinity>();
   std::optional<double> energy;
   if (!resolve_impacts(t, y, energy) || !resolve_holding(t, y, held)) return false;
-  // The loss of the rounds, and of rates up to rounding that are set to zero afterwards.
+  // Kinetic energy lost in the rounds of the impact, and when rates within rounding are set to zero afterwards.
   if (energy) joints_.impact_loss += *energy - core_.energy(v_, step_).kinetic;
   was_decided_ = true;
   return !integrand || integrand->after_transition(t, y, arrivals_, tolerance_.rtol, tolerance_.atol);
 }
 
-// An exceeded holding force changes no velocity, so it has no arrival of its own. If a joint rests at its stop
-// without being held there, its arrival is that it comes to rest.
+// An exceeded holding force is no arrival, because it changes no velocity. A joint that rests at its stop without being
+// held there arrives at rest.
 std::vector<JointArrival> JointModeTransitions::find_arrivals(const std::vector<Event>& triggered) const {
   std::vector<JointArrival> arrivals;
   for (int k = 0; k < core_.n; ++k)
@@ -133,10 +134,10 @@ void JointModeTransitions::scale_responses(const Indices& candidates) {
 // Friction is bounded and has no impulse, so sticking joints are released.
 bool JointModeTransitions::resolve_impacts(double t, Out y, std::optional<double>& energy) {
   Indices candidates;
-  bool any = false;
+  bool approaches_any = false;
   for (int k = 0; k < core_.n; ++k)
-    if (nearby_stop_[k]) candidates.push_back(k), any |= approaches_stop(k);
-  if (!any) return true;
+    if (nearby_stop_[k]) candidates.push_back(k), approaches_any |= approaches_stop(k);
+  if (!approaches_any) return true;
   energy = core_.energy(v_, step_).kinetic;
   if (!system_.acceleration(t, held_acceleration_)) return false;
   joints_.locked.clear();
@@ -192,21 +193,22 @@ bool JointModeTransitions::resolve_impacts(double t, Out y, std::optional<double
       10 * rate_rounding * std::max(fastest_rate, step.cwiseQuotient(reach).lpNorm<Eigen::Infinity>()) * reach;
   for (Eigen::Index i = 0; i < m; ++i) {
     const int k = candidates[i];
-    const double return_rate = return_acceleration(k), offset = gap_rates(i);
-    if (offset == 0.0) {
+    const double return_rate = return_acceleration(k), gap_rate = gap_rates(i);
+    if (gap_rate == 0.0) {
       joints_.stop_side[k] = nearby_stop_[k], rest_speed_(k) = infinity;
       if (!previous_stop_side[k]) record(t, k, JointTransition::touches, nearby_stop_[k]);
     } else if (was_hit[i] || previous_stop_side[k]) {
       record(t, k, previous_stop_side[k] ? JointTransition::leaves : JointTransition::bounces, nearby_stop_[k]);
-      if (return_rate > 0.0) first_bounce_duration = std::min(first_bounce_duration, 2 * offset / return_rate);
+      if (return_rate > 0.0) first_bounce_duration = std::min(first_bounce_duration, 2 * gap_rate / return_rate);
     }
     nearby_stop_[k] = joints_.stop_side[k];
   }
   return true;
 }
 
-// Gauss' principle: choose the accelerations allowed by loops and stops that are closest, in the metric of D', to
-// those without holding forces, minus what friction takes. In forces this is a minimum-norm problem between bounds.
+// Gauss' principle: among the accelerations that loops and stops allow, choose those that are closest, in the metric of
+// D', to the accelerations without holding forces, where friction penalizes |acceleration|. The dual problem is a
+// quadratic program in the holding forces between their bounds.
 bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previously_locked) {
   Indices candidates, locked;
   const Indices previous_direction = joints_.sliding_direction, previous_stop = joints_.stop_side;
@@ -220,7 +222,7 @@ bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previ
   }
   if (!candidates.empty()) {
     if (!system_.acceleration(t, a_)) return false;
-    // If the loops block a joint (a slide at its dead centre), it either reverses or stays at rest.
+    // A joint that the loops block, such as a slide at its dead centre, either reverses or stays at rest.
     const double fastest_rate = a_.cwiseQuotient(joints_.table.reach).lpNorm<Eigen::Infinity>();
     for (int k : candidates)
       if (joints_.has_friction_at(k) &&
@@ -247,7 +249,8 @@ bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previ
                                    rounding_.maxCoeff(), 1e-300});
     const double reduction = holding_was_exceeded_ ? holding_reduction : 0.0;
     b_ /= scale;
-    // Dependent rows have dependent accelerations, up to rounding. Remove the contradiction unless it is a real one.
+    // The accelerations of dependent rows contradict each other within rounding. Remove that part of b_, but no larger
+    // contradiction.
     const Eigen::SelfAdjointEigenSolver<Matrix> eigen(A_);
     const auto& values = eigen.eigenvalues();
     const auto project = [&](double tolerance) {
@@ -264,7 +267,7 @@ bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previ
       const double reduction_here = std::min(reduction, 0.5 * (upper - lower));
       low_(i) = lower + reduction_here, high_(i) = upper - reduction_here;
     }
-    // Without a solution, stops push against each other. Use the closest accelerations that satisfy all of them.
+    // If stops push against each other, there is no solution. Use the closest accelerations that are consistent.
     if (!minimize_in_box(A_, b_, low_, high_, x_)) {
       project(infinity);
       if (!minimize_in_box(A_, b_, low_, high_, x_)) return false;
@@ -272,9 +275,9 @@ bool JointModeTransitions::resolve_holding(double t, Out y, const Indices& previ
     const Vector acceleration = A_ * x_ + b_;
     for (Eigen::Index i = 0; i < m; ++i) {
       const int k = candidates[i];
-      // the slack or the acceleration is zero
-      const double slack = acceleration(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);
-      if (!(std::abs(acceleration(i)) > std::max({acceleration_tolerance, slack, rounding_(i) / scale}))) {
+      // Complementarity: the force is at its bound, or the acceleration is zero.
+      const double bound_distance = acceleration(i) > 0.0 ? x_(i) - low_(i) : high_(i) - x_(i);
+      if (!(std::abs(acceleration(i)) > std::max({acceleration_tolerance, bound_distance, rounding_(i) / scale}))) {
         locked.push_back(k);
         continue;
       }

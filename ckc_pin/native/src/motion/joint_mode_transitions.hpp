@@ -14,15 +14,14 @@ class JointModeTransitions {
   JointModeTransitions(System& system, double min_rise, const Tolerance& tolerance);
 
   void reset();  // at the start of a motion
-  // Update the joint modes at the core's state, that of y, after these events. `time_tolerance`: s, of the events'
-  // times. If velocities jump, y is changed. False if it fails: the system's `failure` says why; if it is `none`, no
-  // contact forces exist.
+  // Update the joint modes at y after these events. `time_tolerance`: s, of the events' times. If velocities jump, y is
+  // changed. False if it fails: the system's `failure` says why; if it is `none`, no contact forces exist.
   bool update(double t, Out y, const std::vector<Event>& triggered, double time_tolerance);
   Vector coordinates;                  // (n), of the state of the update
-  double first_bounce_duration = 0.0;  // s, until the first bounce returns; infinite if there is none
+  double first_bounce_duration = 0.0;  // s, until the first bounce returns to its stop; infinite if there is none
 
  private:
-  bool sync_state(double t, Out y);  // and write the projected state to y
+  bool sync_state(double t, Out y);  // sync the core with y, and write the projected state to y
   // Joints that come to rest or reach a stop at this instant.
   std::vector<JointArrival> find_arrivals(const std::vector<Event>& triggered) const;
   // `energy`: kinetic energy before an impact, J; none without an impact
@@ -44,11 +43,11 @@ class JointModeTransitions {
   Joints& joints_;
   const double min_rise_;
   const Tolerance& tolerance_;
-  bool was_decided_ = false;  // since the start
+  bool was_decided_ = false;  // whether modes have been determined since the start
   Vector v_, a_, held_acceleration_, rest_speed_, step_;
-  Indices nearby_stop_;                         // (n): side of the stop that a joint is at, as `stop_side`
+  Indices nearby_stop_;                 // (n): side of the stop that a joint is at, as `stop_side`
   std::vector<JointArrival> arrivals_;  // joints that have arrived in their new mode at this instant
-  bool holding_was_exceeded_ = false;           // one of the events was an exceeded holding force
+  bool holding_was_exceeded_ = false;   // whether a holding force was exceeded
   Matrix responses_, A_;
   Vector b_, low_, high_, scale_, x_, rounding_;
 };

@@ -6,21 +6,21 @@
 
 namespace ckc {
 
-// smallest singular value of phi_z over |J| below which a better q is searched for
-constexpr double partition_search_margin = 0.03;
-constexpr double search_again_ratio = 0.7;  // search again at this fraction of the margin at which none was found
-constexpr double min_margin = 1e-3;         // below it, search at every step
-constexpr double min_margin_gain = 2.0;     // a better q must increase the margin by this factor
-// weight of a rejected step, in steps of the usual size; sum at which steps are given up
+// Margins are the smallest singular value of phi_z over |J|.
+constexpr double partition_search_margin = 0.03;  // below it a better q is searched for
+constexpr double search_again_ratio = 0.7;        // next search at this fraction of the margin of a search in vain
+constexpr double min_margin = 1e-3;               // below it, search at every step
+constexpr double min_margin_gain = 2.0;           // a better q has to increase the margin by this factor
+// Weight of a disagreement in steps of the usual size, and the balance at which the run is given up.
 constexpr double rejection_weight = 3.0, max_rejection_balance = 100.0;
 constexpr double rounding = 8 * std::numeric_limits<double>::epsilon();
-constexpr double w_lifetime = 100.0;  // in epsilon: after that w is zero
+constexpr double w_lifetime = 100.0;  // in epsilon: later w is set to zero
 
-LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double rhs_slack)
+LevelSet::LevelSet(Core& core_, Control& control_, double epsilon, bool actual, double tolerance, double rhs_tolerance)
     : System(core_, control_, 2 * core_.d),
       epsilon_(epsilon),
       tolerance_(tolerance),
-      rhs_slack_(rhs_slack),
+      rhs_tolerance_(rhs_tolerance),
       actual_(actual),
       fixed_partition_{core.q, core.z},
       search_margin_(partition_search_margin),
@@ -39,7 +39,7 @@ void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
   core.set_configuration(q_tree);
   core.compute_rho();
   reset_coordinates(q_tree);
-  chart_numbers(y);
+  write_chart_coordinates(y);
   for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
 }
 
@@ -51,7 +51,7 @@ void LevelSet::reset_coordinates(In q_tree) {
   partition_changed();
 }
 
-void LevelSet::chart_numbers(Out y) { chart_.numbers(core, core.q_tree, y.head(core.d)); }
+void LevelSet::write_chart_coordinates(Out y) { chart_.coordinates(core, core.q_tree, y.head(core.d)); }
 
 void LevelSet::update_w(double t) {
   if (on_manifold_)
@@ -101,10 +101,10 @@ bool LevelSet::sync_core_at_last_rhs(double t, In y) {
   return true;
 }
 
-bool LevelSet::read_from_state(In y, int k, bool rate, double& value) const {
+bool LevelSet::read_from_state(In y, int k, bool of_rate, double& value) const {
   const auto at = std::find(core.q.begin(), core.q.end(), k);
-  if (at == core.q.end() || !(rate || chart_.is_trivial())) return false;
-  return value = y((rate ? core.d : 0) + (at - core.q.begin())), true;
+  if (at == core.q.end() || !(of_rate || chart_.is_trivial())) return false;
+  return value = y((of_rate ? core.d : 0) + (at - core.q.begin())), true;
 }
 
 bool LevelSet::project_from_predicted(double tolerance) {
@@ -117,7 +117,7 @@ bool LevelSet::project_from_predicted(double tolerance) {
 bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   const int d = core.d;
   if (!finite(y)) return fail(RhsFailure::not_finite);
-  if (!project_state(t, y, disagreements_ || project_to_rounding_ ? tolerance_ : std::max(tolerance_, rhs_slack_)))
+  if (!project_state(t, y, disagreements_ || project_to_rounding_ ? tolerance_ : std::max(tolerance_, rhs_tolerance_)))
     return fail(RhsFailure::loops_open);
   core.set_velocity(v_tree);
   if (!compute_control(t)) return false;
@@ -125,7 +125,7 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   if (chart_.is_trivial())
     y_dot.head(d) = q_dot;
   else
-    chart_.numbers_rate(core, core.q_tree, q_dot, y_dot.head(d));
+    chart_.coordinate_rates(core, core.q_tree, q_dot, y_dot.head(d));
   // On the manifold eq. 6 equals eq. 1 at rho q_dot.
   const Vector& force = applied_force(v_tree);
   const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.compiled && !locked;
@@ -147,7 +147,7 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
 
 bool LevelSet::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
-  project_to_rounding_ = true;  // the slack of the right-hand side is much larger than a difference step
+  project_to_rounding_ = true;  // rhs_tolerance_ is much larger than the difference step
   const bool exists = System::motion_jacobian(t, y, jacobian, evaluations);
   project_to_rounding_ = false;
   return exists;
@@ -168,7 +168,7 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   }
   if (!core.tree.roots.empty()) {
     const Matrix rotated = core.tree.bracket_matrix(v_tree) * core.rho;
-    for (int k = 0; k < d; ++k) {  // J x = J rotated.col(k), x in z only
+    for (int k = 0; k < d; ++k) {  // solve J x = J rotated.col(k) for x in z only
       residual_.noalias() = core.constraints.J * rotated.col(k);
       core.closure_step_in_z(residual_, step_);
       rho_dot_.col(k) -= step_;
@@ -197,7 +197,7 @@ bool LevelSet::tree_acceleration(In f, Out a) const {
   if (!on_manifold_) return false;
   const auto q_ddot = f.segment(core.d, core.d);
   if (!has_tree_acceleration_) return core.tree_acceleration(q_ddot, a), true;
-  a = a_tree_;  // implicit methods ask for another q_ddot than that of f
+  a = a_tree_;  // implicit methods pass an f whose q_ddot differs from that of the right-hand side
   for (int k = 0; k < core.d; ++k) a += (q_ddot(k) - a_tree_(core.q[k])) * core.rho.col(k);
   return true;
 }
@@ -213,7 +213,7 @@ void LevelSet::add_displacement(Out y, In step) const {
 
 void LevelSet::resume(double t, Out y) {
   reset_coordinates(core.q_tree);
-  chart_numbers(y);
+  write_chart_coordinates(y);
   accepted_t_ = t;
 }
 
@@ -245,8 +245,8 @@ void LevelSet::full_motion(In f, Out x, Out x_dot) const {
   }
 }
 
-// y is rounded relative to its largest number, such as a crank's angle after many turns, and z depends on it. An
-// angle near zero is not known better. Errors amplified by a nearly singular phi_z are not rounding.
+// y is rounded relative to its largest entry, such as a crank's angle after many turns, and z depends on it. An angle
+// near zero is therefore no more accurate. Errors that a nearly singular phi_z amplifies are not rounding.
 void LevelSet::add_rounding(In x, Out scale) const {
   const Vector& units = core.scales.columns;
   double largest = 0.0;
@@ -256,8 +256,8 @@ void LevelSet::add_rounding(In x, Out scale) const {
     scale.tail(core.n) += rounding * x.tail(core.n).cwiseQuotient(units).lpNorm<Eigen::Infinity>() * units;
 }
 
-// Off the manifold eq. 8 depends on the choice of q, because only z_dot closes the loops. The partition is kept
-// there.
+// Off the manifold the motion of eq. 8 depends on the choice of q, because only z_dot closes the loops. There the
+// partition does not change.
 Accepted LevelSet::accept_step(double t, Out y, double present_margin) {
   accepted_q_tree_ = last_q_tree_;
   elimination.accept_step(core);
@@ -286,7 +286,7 @@ Accepted LevelSet::accept_step(double t, Out y, double present_margin) {
   if (!chart_.needs_new_reference(y.head(core.d))) return Accepted::unchanged;
   if (!sync_core(t, y)) return Accepted::rejected;
   reset_coordinates(core.q_tree);
-  chart_numbers(y);
+  write_chart_coordinates(y);
   return Accepted::restarted;
 }
 
@@ -298,7 +298,7 @@ bool LevelSet::change_partition(const Partition& partition, double t, Out y) {
   core.set_configuration(q_tree);
   core.compute_rho();
   reset_coordinates(q_tree);
-  chart_numbers(y);
+  write_chart_coordinates(y);
   for (int k = 0; k < core.d; ++k) y(core.d + k) = v(core.q[k]);
   return !core.phi_z.singular() && sync_core(t, y);
 }

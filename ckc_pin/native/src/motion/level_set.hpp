@@ -1,4 +1,4 @@
-// The reduced model, eq. 6, on a level set of phi. With w(t) of eq. 17 it is the SPF. y = (q in a chart, q_dot).
+// The reduced model, eq. 6, on a level set phi = w. With w(t) of eq. 17 it is the SPF. y = (q in a chart, q_dot).
 #pragma once
 
 #include "loops/closure_solver.hpp"
@@ -10,14 +10,14 @@ namespace ckc {
 
 class LevelSet : public System {
  public:
-  // `rhs_slack`: tolerance on |phi - w| in right-hand sides, small enough for the integrator's tolerance.
-  LevelSet(Core& core, Control& control, double epsilon, bool actual, double tolerance, double rhs_slack);
+  // `rhs_tolerance`: tolerance on |phi - w| in right-hand sides, small enough for the integrator's tolerance.
+  LevelSet(Core& core, Control& control, double epsilon, bool actual, double tolerance, double rhs_tolerance);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool sync_core(double t, In y) override { return project_state(t, y, tolerance_); }
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
-  bool read_from_state(In y, int k, bool rate, double& value) const override;
+  bool read_from_state(In y, int k, bool of_rate, double& value) const override;
   double coordinate_margin() override { return phi_z_margin(); }
   Accepted accept_step(double t, Out y, double margin) override;
   bool restore_partition(double t, Out y, bool& changed) override;
@@ -47,25 +47,26 @@ class LevelSet : public System {
   bool project_from_predicted(double tolerance);  // from q_tree_
   bool exact_jacobian(double t, In y, Matrix& jacobian);
   bool change_partition(const Partition& partition, double t, Out y);
-  void chart_numbers(Out y);
+  void write_chart_coordinates(Out y);
 
-  const double epsilon_, tolerance_, rhs_slack_;
+  const double epsilon_, tolerance_, rhs_tolerance_;
   const bool actual_;
   const Partition fixed_partition_;
   bool on_manifold_ = true;
-  // How often z has disagreed with its rates in these coordinates. After the first time, right-hand sides are
-  // projected to the full tolerance, then to rounding. The balance decreases with time, in steps of the usual size.
+  // How often z has disagreed with its integrated rates in these coordinates. After the first time, right-hand sides
+  // are projected to the full tolerance; after the second, to rounding.
   int disagreements_ = 0;
   bool project_to_rounding_ = false;  // regardless of disagreements
-  double rejection_balance_ = 0.0, usual_step_ = 0.0, accepted_t_ = 0.0;
-  double t_start_ = 0.0;
-  double search_margin_;  // below it a better q is searched for
+  // Each disagreement increases the balance, and each accepted step decreases it by its size over the usual step size.
+  double rejection_balance_ = 0.0, usual_step_ = 0.0;
+  double accepted_t_ = 0.0, t_start_ = 0.0;  // s
+  double search_margin_;                     // coordinate margin below which a better q is searched for
   Chart chart_;
   Predictor predictor_;
   ClosureSolver closure_solver_;
-  Vector accepted_q_tree_, last_q_tree_;  // of the last accepted state, and of the last step's end
+  Vector accepted_q_tree_, last_q_tree_;  // q' of the last accepted state, and of the end of the last step
   Vector w0_, q_tree_, residual_, z_, step_;
-  bool has_tree_acceleration_ = false;  // a_tree_ belongs to the last right-hand side
+  bool has_tree_acceleration_ = false;  // whether a_tree_ belongs to the last right-hand side
   Vector a_tree_, unit_q_dot_;
   Matrix rho_dot_;
 };

@@ -10,11 +10,11 @@ using Clock = std::chrono::steady_clock;
 
 // Upper bound of rtol in runs that cross singular positions. With larger values errors reach 1e-2 after ten seconds.
 constexpr double crossing_rtol = 1e-7;
-// of the remaining time: smallest step that is retried if its end or interior cannot be evaluated
+// Smallest step, relative to the remaining time, that is retried if its end or interior cannot be evaluated.
 constexpr double min_retry_fraction = 1e-9;
-// relative to the tolerances: a larger change of a conservative motion's energy means a wrong step
+// Energy change of a step of a conservative motion, relative to the tolerances, above which the step is wrong.
 constexpr double max_energy_change = 100.0;
-// rad, or relative to the mechanism's size: smaller bounces are within the closure tolerance
+// Lower bounces are within the closure tolerance; rad, or relative to the mechanism's size.
 constexpr double min_bounce_rise = 1e-10;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
@@ -22,7 +22,7 @@ static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
   return system.crosses_singularities ? std::make_unique<Collocation>(system, work) : nullptr;
 }
 
-// The system with the integrand appended to it, as the members built after it need it.
+// Return the system with the integrand appended. Members that are constructed later need its full size.
 static std::unique_ptr<System> with_integrand(std::unique_ptr<System> system, Integrand* integrand) {
   if (integrand) system->append(*integrand);
   return system;
@@ -103,7 +103,8 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
     if (changed) state_is_accepted_ = false, state_changed();
   }
   may_step_beyond_ = !final && !control->law && events.is_empty();
-  // as far as nothing has changed recently; `advances_unchanged_` is zero if the partition has just been restored
+  // Reach as far beyond as the last calls advanced without a change. `advances_unchanged_` is zero if the partition was
+  // just restored.
   if (!continues)
     reach_beyond_ = may_step_beyond_ && advances_unchanged_ > 0
                         ? static_cast<double>(advances_unchanged_ - 1) * (until - from)
@@ -121,7 +122,6 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
     double bound = until;
     if (control->sampling && control->sampling->next_instant() < until - time_tolerance)
       bound = control->sampling->next_instant();
-    // not after a mere pause
     if (bound + reach_beyond_ != segment_end_)
       choose_explicit_method(bound + reach_beyond_), segment_end_ = bound + reach_beyond_;
     if (const auto stop = prepare_step(bound + reach_beyond_)) return *stop;
@@ -129,7 +129,7 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
       const double t_before = now.t;
       if (const auto stop = make_step(bound + reach_beyond_, final && bound == until)) {
         if (reach_beyond_ == 0.0 || now.t != t_before || stop->reason == Stop::rhs_budget) return *stop;
-        reach_beyond_ = 0.0, now.h = std::min(now.h, bound - now.t);  // the obstacle may lie beyond `bound`
+        reach_beyond_ = 0.0, now.h = std::min(now.h, bound - now.t);  // the cause of the stop may lie beyond `bound`
         continue;
       }
       if (waiting_step_) return report_present(until);
@@ -141,7 +141,7 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
   }
 }
 
-// Without a budget, stop runs that would take hours, such as a motion that turns ever faster.
+// Without a budget, stop runs that would take hours, such as a motion that rotates ever faster.
 std::optional<Stop> StepLoop::check_pace(double until) {
   constexpr long min_rhs = 1'000'000;
   constexpr double max_remaining_rhs = 1e9;
@@ -312,7 +312,7 @@ std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) 
       state_is_accepted_ = false;
       state_changed(), events.restart();
       if (!events.stopped()) return {};  // only joint modes change
-      // was recorded before an impact
+      // The state before an impact may have been recorded.
       if (system->core.joints.has_events() && now.t == now.t_old) recorder.drop_row_at(now.t);
       if (!record_now()) return step_failure();
       return Stop{Stop::event, now.t};

@@ -24,15 +24,15 @@ struct Options {
 
 struct Stop {
   enum Reason {
-    end,    // the requested time is reached
-    event,  // a stopping event occurred
-    pause,  // the interpreter should run
-    rhs_budget,
-    wall_budget,
-    pace,  // the rest would take too many right-hand sides
-    min_step,
+    end,                   // the requested time is reached
+    event,                 // a stopping event occurred
+    pause,                 // the interpreter should run
+    rhs_budget,            // the budget of right-hand sides is used up
+    wall_budget,           // the budget of time is used up
+    pace,                  // the remaining motion would take too many right-hand sides
+    min_step,              // the step size fell below its minimum
     step,                  // no step can be made, see System::failure
-    rank,                  // J loses rank, and that cannot be crossed
+    rank,                  // J loses rank, and the position cannot be crossed
     coordinates_singular,  // phi_z is singular: q does not determine z
     energy,                // the energy of a conservative motion changes, however short the step
     control,               // the controller has no u
@@ -43,8 +43,9 @@ struct Stop {
     beyond_stop,           // joint `which` has passed its stop
     exception,             // a callback raised an exception
   } reason;
-  double t = 0.0, value = 0.0;  // time; smallest singular value, right-hand sides, or value of a function
-  int which = -1;               // event or coordinate
+  double t = 0.0;      // s
+  double value = 0.0;  // smallest singular value, right-hand sides, energy change, or value of a function
+  int which = -1;      // event or coordinate
 };
 
 class StepLoop {
@@ -53,15 +54,18 @@ class StepLoop {
   StepLoop(std::unique_ptr<Control> control, std::unique_ptr<System> system, std::unique_ptr<Integrand> integrand,
            Options options, std::vector<Event> events);
 
-  // Start at t from a configuration with phi = w and velocity v'. Earlier runs have no influence.
+  // Start at t from a configuration with phi = w and velocity v'. Earlier runs do not influence the result.
   void start(double t, In q_tree, In v_tree, In w);
-  void record(Vector instants, double* rows, Eigen::Index most) { recorder.start(std::move(instants), rows, most); }
+  void record(Vector instants, double* rows, Eigen::Index max_rows) {
+    recorder.start(std::move(instants), rows, max_rows);
+  }
   // Apply a constant u, or constant motor torques, from now on.
   void set_control(In u, bool of_motors);
   // Advance to a time. `final`: the motion ends there. `pause`, `budget`: seconds until the next pause and until the
-  // end of the budget. If the motion does not end and nothing has changed for several calls, the last step may reach
-  // beyond `until`. The present state is then inside that step, and the step is discarded if something changes.
-  // A call with the same `until` after a pause continues as if there had been none.
+  // end of the budget. A call with the same `until` after a pause continues as if there had been none.
+  //
+  // If the motion does not end and neither control nor state have changed for several calls, the last step may end
+  // beyond `until`. The present state is then inside that step, which is discarded at the next change.
   Stop advance(double until, bool final, double pause, double budget);
   // Present time and state.
   double t() const { return waiting_step_ ? t_present_ : now.t; }
@@ -86,13 +90,11 @@ class StepLoop {
   long pause_at = std::numeric_limits<long>::max();
 
  private:
-  // A completed step: its interpolant, the time at which J lost rank (NaN for an ordinary step), and rank and margin
-  // at its end.
   struct CompletedStep {
     Interpolant* motion;
-    double crossed_at;
-    RankMonitor::Rank after;
-    double margin;
+    double crossed_at;        // s, time at which J lost rank; NaN for an ordinary step
+    RankMonitor::Rank after;  // at its end
+    double margin;            // `coordinate_margin` at its end
   };
   std::optional<Stop> prepare_step(double bound);
   std::optional<Stop> make_step(double bound, bool last);
@@ -105,18 +107,18 @@ class StepLoop {
   std::optional<Stop> check_stiffness(double bound);
   std::optional<Stop> check_pace(double until);
   Stop report_present(double until);  // inside the waiting step
-  void start_state();          // of `start_`
+  void start_state();                 // sets the state to `start_`
   Accepted accept_state(double t, Out y, double margin);
-  void return_to_present();           // discards the waiting step
+  void return_to_present();  // discards the waiting step
   std::optional<Stop> find_events(Interpolant& motion, bool last, double& stop_time);
   Stop event_failure();
   std::optional<Stop> record_outputs(Interpolant& motion, double until);
   std::optional<Stop> repeat_with_finer_tolerance();
-  int method_index() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // in `steps`
+  int method_index() const { return method_ == &dop853_ ? 0 : method_ == &rk45_ ? 1 : 2; }  // as in `steps`
   std::optional<Stop> sample_control();
   Stop step_failure();
   Stop output_failure();
-  void state_changed();
+  void state_changed();  // the motion continues from another state or with another control
   // Decide which joints slide, stick and touch from the present state on.
   std::optional<Stop> update_joint_modes();
   void reset_joints();
@@ -140,20 +142,20 @@ class StepLoop {
   JointModeTransitions joint_transitions_;
   RankMonitor::Rank end_rank_;  // at the present state
   double last_step_size_ = 0.0;
-  bool state_is_accepted_ = false;  // and end_rank_ is valid
-  bool rate_is_known_ = false;
-  bool joint_modes_known_ = true;    // for the motion from the present state on
-  double joint_modes_time_ = 0.0;    // s, of the last update of joint modes
-  long transitions_at_instant_ = 0;  // transitions within the tolerance of that time
-  bool cannot_repeat_ = false;       // control or state have changed since the start, so the run cannot be repeated
-  bool is_repeating_ = false;        // the run is being repeated: do not record or report events
-  // since the start; number of steps at which stiffness is checked next, 0 for never
-  long accepted_steps_ = 0, next_stiffness_check_ = 0;
-  long pace_rhs_ = 0;          // right-hand sides at the last check of the pace
-  double pace_time_ = 0.0;     // s, of that check
-  long joint_segments_ = 0;    // number of joint transitions since the start
-  double record_until_ = 0.0;  // outputs up to this time belong to the present segment
-  double segment_end_ = 0.0;   // end of the present segment; the start, before the first one
+  bool state_is_accepted_ = false;   // whether the present state was accepted; end_rank_ is then valid
+  bool rate_is_known_ = false;       // whether now.f is the rate of the present state
+  bool joint_modes_known_ = true;    // whether the joint modes are those of the motion from the present state on
+  double joint_modes_time_ = 0.0;    // s, time of the last update of joint modes
+  long transitions_at_instant_ = 0;  // updates of joint modes within the tolerance of that time
+  bool cannot_repeat_ = false;       // control or state have changed since the start
+  bool is_repeating_ = false;        // the run is being repeated: nothing is recorded, no user's event is reported
+  long accepted_steps_ = 0;          // since the start, while stiffness is checked
+  long next_stiffness_check_ = 0;    // number of steps at which stiffness is checked next; 0: never
+  long pace_rhs_ = 0;                // right-hand sides at the last check of the pace
+  double pace_time_ = 0.0;           // s, time of that check
+  long joint_segments_ = 0;          // instants of joint transitions since the start
+  double record_until_ = 0.0;        // s; outputs up to this time belong to the present segment
+  double segment_end_ = 0.0;         // s, end of the present segment; before the first one, the start
   struct Start {
     double t = 0.0;
     Vector q_tree, v_tree, w;
@@ -162,11 +164,12 @@ class StepLoop {
 
   bool may_step_beyond_ = false;               // whether a step may end beyond the requested time
   std::optional<CompletedStep> waiting_step_;  // such a step
-  double target_ = 0.0, t_present_ = 0.0;      // requested time; present time inside that step
-  Vector y_present_;
+  double t_present_ = 0.0;                     // s, present time inside that step
+  Vector y_present_;                           // state at that time
+  double target_ = 0.0;                        // s, requested time
   long advances_unchanged_ = 0;  // calls of `advance` since the last change, without those that continue after a pause
   double reach_beyond_ = 0.0;    // s, how far a step may end beyond the requested time
-  bool is_paused_ = false;       // `advance` returned for a pause, and nothing has changed since
+  bool is_paused_ = false;       // whether `advance` returned for a pause, and nothing has changed since
 };
 
 }  // namespace ckc

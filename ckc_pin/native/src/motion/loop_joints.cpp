@@ -6,18 +6,18 @@
 
 namespace ckc {
 
-// s, and relative to the last step: accuracy of an event's time
+// Accuracy of an event's time: in s, and relative to the last step size.
 constexpr double event_time_tolerance = 4e-12, relative_event_time_tolerance = 1e-9;
 constexpr long max_transitions_at_instant = 200;
 // After this many transitions at one instant, the rounding tolerance of forces grows step by step, up to 1e-6 of the
-// forces, so that joints stay locked.
+// forces. Joints then stay locked.
 constexpr long transitions_before_growth = 10, max_growth_steps = 12;
 constexpr double rounding_growth = 4.0;
-// of the fastest coordinate: above it an immobile joint has started to move
-constexpr double min_relative_immobile_rate = 1e-9;
-// rad, or relative to the mechanism's size: beyond it a stop was passed unnoticed
+// Rate above which a joint that was blocked by the loops has started to move, relative to the fastest coordinate.
+constexpr double max_relative_immobile_rate = 1e-9;
+// Distance beyond a stop at which its event was missed; rad, or relative to the mechanism's size.
 constexpr double stop_passed_tolerance = 1e-7;
-constexpr double max_flight_ratio = 1.5;  // of the following bounce's duration: largest first step
+constexpr double max_flight_ratio = 1.5;  // largest first step after an impact, relative to the duration of the bounce
 
 void StepLoop::reset_joints() {
   system->core.joints.reset();
@@ -30,7 +30,7 @@ std::optional<Stop> StepLoop::update_joint_modes() {
   transitions_at_instant_ = std::abs(now.t - joint_modes_time_) <= time_tolerance ? transitions_at_instant_ + 1 : 0;
   if (!transitions_at_instant_ && now.t > start_.t) ++joint_segments_;
   joint_modes_time_ = now.t;
-  if (!is_repeating_ && !events.learn_signs_before_change(now.t, now.y)) return event_failure();
+  if (!is_repeating_ && !events.determine_signs_before_transition(now.t, now.y)) return event_failure();
   if (transitions_at_instant_ > max_transitions_at_instant) return Stop{Stop::chatter, now.t};
   system->core.joints.rounding_factor = std::pow(
       rounding_growth, std::clamp<long>(transitions_at_instant_ - transitions_before_growth, 0, max_growth_steps));
@@ -60,7 +60,7 @@ std::optional<Stop> StepLoop::check_joints() {
   const int beyond =
       joints.find_joint_beyond_stop(system->core.q_tree, system->core.tree.q_index, stop_passed_tolerance);
   if (beyond >= 0) return Stop{Stop::beyond_stop, now.t, 0.0, beyond};
-  const double rate_tolerance = min_relative_immobile_rate * system->velocity.lpNorm<Eigen::Infinity>();
+  const double rate_tolerance = max_relative_immobile_rate * system->velocity.lpNorm<Eigen::Infinity>();
   for (int k : joints.immobile)
     if (std::abs(system->velocity(k)) > rate_tolerance) return state_changed(), std::nullopt;
   return {};

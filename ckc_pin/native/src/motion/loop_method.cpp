@@ -6,8 +6,8 @@
 
 namespace ckc {
 
-constexpr long first_stiffness_check = 50;  // steps after which stiffness is checked; checked again after twice as many
-constexpr double max_rk45_steps = 2.0;      // shorter segments use RK45
+constexpr long first_stiffness_check = 50;  // steps before the first check of stiffness; doubled after each check
+constexpr double max_rk45_steps = 2.0;      // RK45 integrates segments of at most this many of its steps
 
 void StepLoop::use_method(Method& method) {
   if (method_ == &method) return;
@@ -42,7 +42,8 @@ void StepLoop::choose_explicit_method(double bound) {
   now.h = &best == &rk45_ ? reach : std::max(now.h, max_rk45_steps * reach);
 }
 
-// Expected time until the next joint transition: the mean of the previous segments, at least the present duration.
+// Expected duration of the present segment: until the bound, or the mean of the previous segments between joint
+// transitions, but at least the time since the last one.
 double StepLoop::segment_duration(double bound) const {
   const double remaining = bound - now.t;
   return joint_segments_ ? std::min(remaining, std::max((now.t - start_.t) / static_cast<double>(joint_segments_),
@@ -50,8 +51,8 @@ double StepLoop::segment_duration(double bound) const {
                          : remaining;
 }
 
-// Consider the present segment only: a joint transition excites modes again that had decayed, and they must be
-// resolved.
+// Consider the present segment only: a joint transition excites modes that had decayed, and they must be resolved
+// again.
 bool StepLoop::motion_is_stiff(double bound) {
   Matrix jacobian;
   ++work.jacobians;
@@ -59,7 +60,7 @@ bool StepLoop::motion_is_stiff(double bound) {
          is_stiff(jacobian, segment_duration(bound));
 }
 
-// A motion that is not stiff at the start may become stiff, so check again after a while.
+// A motion may become stiff after its start.
 std::optional<Stop> StepLoop::check_stiffness(double bound) {
   if (!next_stiffness_check_ || ++accepted_steps_ < next_stiffness_check_) return {};
   next_stiffness_check_ *= 2;

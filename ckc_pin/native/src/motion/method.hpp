@@ -15,16 +15,18 @@ struct Tolerance {
   }
 };
 
+// A step from (t, y) to (t_new, y_new).
 struct Step {
-  double t = 0, h = 0;  // from (t, y) with rate f; h: step size to try
-  Vector y, f;
-  Vector x, x_dot;               // full motion and its rate at t
-  double t_new = 0, h_next = 0;  // to (t_new, y_new)
+  double t = 0, h = 0;           // h: step size to try
+  Vector y, f;                   // f: rate of y
+  Vector x, x_dot;               // full motion and its rate, see System::full_motion
+  double t_new = 0, h_next = 0;  // h_next: size of the next step
   Vector y_new, f_new, x_new, x_dot_new;
   double t_old = 0;  // start of the previous step
   Vector y_old;
 };
 
+// Counters of the work done, and its budget.
 struct Work {
   long rhs = 0, rejected = 0, jacobians = 0, factorizations = 0;
   long max_rhs = std::numeric_limits<long>::max();
@@ -48,7 +50,8 @@ class Method : public Interpolant {
  public:
   Method(System& system, Step& step, Work& work, const Tolerance& tolerance)
       : system_(system), step_(step), work_(work), tolerance_(tolerance) {}
-  // Try steps from (t, y, f) until one is accepted. False if none can be; the state is then unchanged.
+  // Try steps from (t, y, f) until the error of one is small enough. False if that is impossible; the state is then
+  // unchanged.
   virtual bool make_step(double t_bound) = 0;
   // Discard the last step and try another step size next.
   virtual void reject_step(double step_size) { step_.h = step_size, ++work_.rejected; }
@@ -61,7 +64,7 @@ class Method : public Interpolant {
   // Forget previous steps.
   virtual void reset_history() {}
   virtual const char* name() const = 0;
-  // Initial step size for a method with an error estimate of this order; (t, y, f) are known.
+  // Initial step size for a method with an error estimate of this order; requires f.
   double initial_step_size(double t_bound, int order);
   virtual int error_order() const = 0;
 
@@ -71,15 +74,15 @@ class Method : public Interpolant {
   bool evaluate(double t, In y, Out y_dot) { return work_.count_rhs() && system_.rhs(t, y, y_dot); }
 
  protected:
-  // Whether shorter steps would not help.
+  // Whether to give up, because shorter steps would not help.
   bool must_stop() const { return work_.budget_exhausted || system_.control.failure.raised; }
   // Smallest step size that changes t.
   double min_step_size(double t_bound) const;
-  // Whether to check the full motion in a step of size h. If y is only a part of the motion, the rest must agree with
-  // the integral of its rates. Near a singular phi_z or on another branch it does not, however small the error of y
-  // is.
+  // Whether to check the full motion in a step of size h. If y is only a part of the motion, the full motion has to
+  // agree with the integral of its rates. Near a singular phi_z or on another branch it does not, however small the
+  // error of y.
   bool checks_full_motion(double h) const { return step_.x.size() && h <= system_.full_motion_max_step(); }
-  double disagreement(In integral);  // of the full motion with the integral of its rates, relative to the tolerance
+  double disagreement(In integral);  // of the full motion with this integral of its rates, relative to the tolerance
   // After a step was rejected for a disagreement: project its start again, more exactly.
   bool return_to_start();
 

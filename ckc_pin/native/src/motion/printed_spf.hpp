@@ -20,12 +20,12 @@ class PrintedSpf : public System {
   }
   double w_decay_rate() const override { return -1.0 / epsilon_; }
   bool tree_acceleration(In, Out) const override { return false; }
-  void add_velocity(Out, In) const override {}  // joints have no friction or stops in this formulation
+  void add_velocity(Out, In) const override {}  // this formulation does not support friction and stops
   void add_displacement(Out, In) const override {}
 
  private:
   bool motion_rhs(double t, In y, Out y_dot) override;
-  void set_state(double t, In y);  // of the core; z_dot_ is evaluated at the actual phi
+  void set_state(double t, In y);  // sets the core, and z_dot_ by eq. 8 with the actual phi
 
   const double epsilon_;
   const bool actual_;

@@ -10,21 +10,23 @@
 namespace ckc {
 
 constexpr double min_factor = 0.2, max_factor = 8.0, safety = 0.9;
-// Largest ratio of the second correction to the first: z follows changes that stiff control makes to q one iteration
-// later.
+// Largest ratio of the second Newton correction to the first. It may exceed 1, because z follows the corrections that
+// stiff control causes in q one iteration later.
 constexpr double max_second_correction = 2.0;
-constexpr double jacobian_time = 0.8;         // of a step: where the Jacobian is evaluated
+constexpr double jacobian_time = 0.8;         // fraction of the step at which the Jacobian is evaluated
 constexpr double refresh_contraction = 0.02;  // Newton contraction above which the Jacobian is evaluated again
-// step size changes in this range do not justify a new factorization
+// A change of the step size within this range does not justify a new factorization.
 constexpr double min_factor_kept = 0.9, max_factor_kept = 1.2;
-constexpr double error_pessimism = 3.0;  // factor by which the error estimate is too large, with five or more stages
-// Largest disagreement of z with its integrated rates, relative to the error. The rates are those before the last
-// correction.
+constexpr double error_pessimism = 3.0;  // ratio of the error estimate to the error, with five or more stages
+// Largest disagreement of z with its integrated rates, relative to the tolerance. It is larger than 1 because the rates
+// are those before the last correction.
 constexpr double max_disagreement = 10.0;
-constexpr int cautious_steps = 3;  // after a failure of Newton's method, and their growth
-constexpr double cautious_growth = 1.5, slow_contraction = 0.3;
+// Steps whose growth is limited after a failure of Newton's method, and that limit.
+constexpr int cautious_steps = 3;
+constexpr double cautious_growth = 1.5;
+constexpr double slow_contraction = 0.3;  // Newton contraction above which the step does not grow
 
-// A tighter tolerance gets more iterations; each gains about a digit.
+// A smaller tolerance allows more iterations; each gains about one digit.
 static int max_iterations_for(int stages, double newton_tolerance) {
   return (stages == 7 ? 8 : 6) + std::max(0, int(-std::log10(newton_tolerance)));
 }
@@ -38,13 +40,13 @@ Radau::Radau(System& system, Step& step, Work& work, const Tolerance& tolerance)
   const int n = system.size, s = stages_;
   tabulate();
   Z_dot_.setZero(n, s), Z_.setZero(n, s), F_.setZero(n, s), dZ_.setZero(n, s);
-  for (Vector* x : {&scale_, &error_, &y_stage_, &f_stage_, &real_right_, &real_correction_}) x->setZero(n);
+  for (Vector* x : {&scale_, &error_, &y_stage_, &f_stage_, &real_rhs_, &real_correction_}) x->setZero(n);
   complex_rhs_.setZero(n), complex_correction_.setZero(n);
   complex_factors_.resize(s / 2);
   for (Polynomial* p : {&last_polynomial_, &step_polynomial_}) p->series.setZero(n, s), p->y.setZero(n);
 }
 
-// The nodes are the zeros of P_s - P_(s - 1), which include the right end. All other coefficients follow from them.
+// The nodes are the zeros of P_s - P_(s - 1), which include the right end. The other coefficients follow from them.
 void Radau::tabulate() {
   const int s = stages_;
   const Vector nodes = radau_nodes(s);
@@ -190,8 +192,8 @@ void Radau::factorize(double h) {
 // (A^-1 / h - J) dZ = F - A^-1 Z / h, in the eigenvectors of A^-1.
 void Radau::solve_linear_system() {
   F_ -= Z_dot_;
-  real_right_.noalias() = F_ * V_inverse_.row(0).real().transpose();
-  real_factors_.solve(*this, real_right_, real_correction_);
+  real_rhs_.noalias() = F_ * V_inverse_.row(0).real().transpose();
+  real_factors_.solve(*this, real_rhs_, real_correction_);
   dZ_.noalias() = real_correction_ * V_.col(0).real().transpose();
   for (size_t k = 0; k < complex_factors_.size(); ++k) {
     complex_rhs_.noalias() = F_ * V_inverse_.row(k + 1).transpose();
@@ -236,8 +238,8 @@ Radau::Newton Radau::iterate(double h) {
 
 // Error estimate of order s - 1, filtered so that it stays bounded for stiff motions.
 double Radau::estimate_error(const Vector& f, double h) {
-  real_right_.noalias() = f + (1.0 / h) * Z_ * e_;
-  real_factors_.solve(*this, real_right_, error_);
+  real_rhs_.noalias() = f + (1.0 / h) * Z_ * e_;
+  real_factors_.solve(*this, real_rhs_, error_);
   scale_ = tolerance_.scale(step_.y, step_.y_new);
   return norm(error_, scale_) / (stages_ > 3 ? error_pessimism : 1.0);
 }

@@ -1,8 +1,9 @@
 // Radau IIA: implicit collocation of order 5, 9 or 13. It is stiffly accurate and a one-step method, so projections,
 // events and held forces do not disturb it.
 //
-// After E. Hairer and G. Wanner, Stiff differential equations solved by Radau methods, 1999. The Jacobian is
-// evaluated ahead, on the extrapolated last polynomial, which halves the Newton iterations of controlled motions.
+// After E. Hairer and G. Wanner, Stiff differential equations solved by Radau methods, 1999. The Jacobian is evaluated
+// near the end of the step, on the extrapolated polynomial of the last step. This halves the Newton iterations of
+// controlled motions.
 #pragma once
 
 #include <complex>
@@ -28,7 +29,7 @@ class Radau : public Method {
  private:
   using Complex = std::complex<double>;
 
-  // A collocation polynomial from (t, y), as a Legendre series of its rate.
+  // A collocation polynomial that starts at (t, y), as the Legendre series of its rate.
   struct Polynomial {
     Matrix series;
     Vector y;
@@ -50,17 +51,19 @@ class Radau : public Method {
   void propose_step_size(double h, double size, double effort, double exponent);
 
   const int stages_, max_iterations_;
-  Vector c_, e_;  // nodes; weights of the error estimate
-  Matrix A_inverse_, to_series_;
+  Vector c_, e_;                    // nodes; weights of the error estimate
+  Matrix A_inverse_;                // inverse of the Runge-Kutta matrix
+  Matrix to_series_;                // maps Z_ to a Legendre series, multiplied from the right
   Vector legendre_integrals_;       // integrals of the Legendre polynomials at one point
-  Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1; one of each conjugate pair
+  Eigen::MatrixXcd V_, V_inverse_;  // A_inverse_ = V diag(lambda) V^-1; one eigenvalue of each conjugate pair
   Eigen::VectorXcd lambda_;
 
   // A diagonal block of the Jacobian: of the motion, or of one column of the integrand.
   struct Block {
     Matrix J;
     std::vector<std::pair<int, int>> rates;  // (i, j): the rate of entry i is entry j
-    Indices remaining, position;             // entries that are not eliminated; index among them by entry, else -1
+    Indices remaining;                       // entries that are not eliminated
+    Indices position;                        // by entry: its index in `remaining`, -1 if it is eliminated
     void update_indices();                   // from `rates`
   };
 
@@ -87,19 +90,24 @@ class Radau : public Method {
                Eigen::Ref<typename ShiftedBlock<Scalar>::Column> x);
   };
 
-  Matrix Z_, F_, dZ_;
-  Matrix Z_dot_, X_;  // rates of the polynomials at the stages, and of the full motion
-  Vector b_, x_stage_;
+  Matrix Z_, dZ_;  // y at the stages relative to the start, and Newton's correction
+  Matrix F_;       // right-hand sides at the stages
+  Matrix Z_dot_;   // rates of the polynomial at the stages
+  Matrix X_;       // rates of the full motion at the stages
+  Vector b_;       // weights of the quadrature
+  Vector x_stage_;
   Block motion_block_, integrand_block_;
-  bool blocks_are_equal_ = false;                  // the integrand's block equals that of the motion
+  bool blocks_are_equal_ = false;                  // whether the integrand's block equals that of the motion
   Factors<double> real_factors_;                   // of the real eigenvalue
   std::vector<Factors<Complex>> complex_factors_;  // of the complex pairs
   Eigen::VectorXcd complex_rhs_, complex_correction_;
-  Vector scale_, error_, y_stage_, f_stage_, real_right_, real_correction_;
-  double factorized_step_ = 0.0;  // step size of the factorization
-  bool jacobian_is_valid_ = false, jacobian_is_fresh_ = false;
-  double contraction_ = 0.0, correction_size_ = 0.0;
-  int iterations_ = 0, cautious_steps_left_ = 0;
+  Vector scale_, error_, y_stage_, f_stage_, real_rhs_, real_correction_;
+  double factorized_step_ = 0.0;                      // step size of the factorization
+  bool jacobian_is_valid_ = false;                    // accurate enough for the next step
+  bool jacobian_is_fresh_ = false;                    // evaluated for the present step
+  double contraction_ = 0.0, correction_size_ = 0.0;  // of the last Newton iteration
+  int iterations_ = 0;
+  int cautious_steps_left_ = 0;  // steps whose growth is limited
   double error_old_ = 0.0, h_old_ = 0.0, error_new_ = 0.0;
   Polynomial last_polynomial_, step_polynomial_;  // of the last accepted step, and of the new one
 };

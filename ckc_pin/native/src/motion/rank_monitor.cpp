@@ -5,13 +5,13 @@
 
 namespace ckc {
 
-// Relative to the larger end value: a V whose tangents meet below the first is searched for its minimum; a minimum
-// below the second must be resolved by shorter steps.
+// Relative to the larger value at the ends. A V whose tangents meet below the first bound is searched for its minimum.
+// A minimum below the second has to be resolved by shorter steps.
 constexpr double max_valley_ratio = 0.7, max_minimum_ratio = 0.2;
-// of the time to s = 0 along the tangent: longest step that begins and ends falling
+// Longest step that begins and ends with falling s, relative to the time to s = 0 along the tangent.
 constexpr double max_zero_time_ratio = 0.7;
-constexpr double look_ahead_steps = 4.0;    // in step sizes: crossings that are nearer are searched for
-constexpr double min_resolved_step = 1e-6;  // s; shorter steps resolve any gap that is wider than `rank_lost`
+constexpr double look_ahead_steps = 4.0;    // number of steps within which crossings are expected
+constexpr double min_resolved_step = 1e-6;  // s; shorter steps resolve any gap between branches wider than `rank_lost`
 
 RankMonitor::RankMonitor(const Core& core) : smallest_singular_value_(core.constraints.pattern, core.n, core.rank) {
   u_.setZero(core.constraints.closure.rows), v_.setZero(core.n);
@@ -50,7 +50,7 @@ double RankMonitor::step_fraction(const Rank& before, const Rank& after, double 
                ? std::nan("")
                : 1.0;
   }
-  // falling, zero, a peak, and falling again; or a peak, zero, and rising again
+  // Between the ends s may fall to zero, rise to a peak and fall again, or rise to a peak, fall to zero and rise again.
   const bool passes_zero = before.rate < 0.0 ? h > max_zero_time_ratio * before.value / -before.rate
                                              : after.rate > 0.0 && h * after.rate > after.value;
   return passes_zero && h > min_resolved_step ? 0.5 : 1.0;

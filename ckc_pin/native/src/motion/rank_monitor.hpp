@@ -1,8 +1,8 @@
 // Monitors J for a loss of rank, where branches of the motion meet.
 //
 // At a change point (such as a flat four-bar) the loops do not determine the motion. A step across it may end on the
-// other branch, within tolerance but wrong. The smallest singular value s(t) of J then has a V that reaches zero: it
-// falls at the start of the step and rises at its end. The minimum is searched for in such steps.
+// other branch, within tolerance but wrong. The smallest singular value s(t) of J then has the shape of a V that
+// reaches zero: it falls at the start of the step and rises at its end. In such steps its minimum is searched.
 #pragma once
 
 #include <limits>

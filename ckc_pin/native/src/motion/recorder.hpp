@@ -18,9 +18,9 @@ class Recorder {
   explicit Recorder(const System& system);
 
   const std::vector<RecordColumns> columns;
-  const Eigen::Index width;  // numbers in a row
+  const Eigen::Index width;  // columns of a row
 
-  void start(Vector instants, double* rows, Eigen::Index max_rows);  // (max_rows, width)
+  void start(Vector instants, double* rows, Eigen::Index max_rows);  // rows: (max_rows, width)
   bool is_due(double t) const { return next_ < instants_.size() && instants_(next_) <= t && filled < max_rows_; }
   double next_instant() const { return instants_(next_); }
   bool is_full() const { return filled == max_rows_; }
@@ -30,7 +30,7 @@ class Recorder {
   // Remove the last row if its time is t, so that another state can be recorded there.
   void drop_row_at(double t) { filled -= filled && rows_[(filled - 1) * width] >= t; }
 
-  Eigen::Index filled = 0;
+  Eigen::Index filled = 0;  // recorded rows
 
  private:
   bool fill_row(System& system, double t, In y, Out row);

@@ -9,14 +9,14 @@
 
 namespace ckc {
 
-constexpr double zero_rounding = 1e-12;        // of the largest value in the step: smaller values count as zero
-constexpr double max_extremum_ratio = 0.25;    // of the function's range in the step: closer extrema are refined
+constexpr double zero_rounding = 1e-12;        // smaller values are zero; relative to the largest value in the step
+constexpr double max_extremum_ratio = 0.25;    // extrema closer to zero are refined; relative to the range in the step
 constexpr double root_time_tolerance = 1e-12;  // s
-constexpr int max_secant_steps = 6;            // from an approximate root
-constexpr double secant_width = 1e-3;          // of the step: width of the first secant, and relative error of its step
-constexpr int fine_points_per_degree = 64;     // points per degree at which extrema of the polynomial are searched
-constexpr int kink_search_bits = 30;           // accuracy of the search for a kink
-// times the error of the cheap function: closer extrema may touch zero
+constexpr int max_secant_steps = 6;            // from a root of the cheap function to that of the exact one
+constexpr double secant_width = 1e-3;          // of the first secant, relative to the step; also its relative error
+constexpr int fine_points_per_degree = 64;     // at which extrema of the interpolating polynomial are searched
+constexpr int kink_search_bits = 30;           // bits of accuracy of the search for a kink
+// Extrema of the cheap function closer to zero than this times its error may touch zero.
 constexpr double max_exact_difference_ratio = 10.0;
 
 namespace {
@@ -93,7 +93,8 @@ bool refine_root(const ScalarFunction& function, const ScalarFunction& exact, co
   return first * last < 0.0 ? find_root(exact, {start.first, first}, {end.first, last}, t) : true;
 }
 
-// Whether the exact function may touch zero where the approximate one does not, or the other way round.
+// Find out whether the exact function may touch zero where the approximate one does not, or vice versa. False if the
+// function has no value.
 bool may_touch_zero(const ScalarFunction& exact, double range, const Points& points, bool& may_touch) {
   may_touch = false;
   for (size_t k = 1; k + 1 < points.size() && !may_touch; ++k) {

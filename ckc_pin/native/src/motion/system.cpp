@@ -5,7 +5,7 @@
 
 namespace ckc {
 
-constexpr double difference_step = 1.5e-8;  // step of forward differences: relative, or rad, m, and their rates
+constexpr double difference_step = 1.5e-8;  // of forward differences, relative to max(1, |y|)
 
 System::System(Core& core_, Control& control_, int motion_size_)
     : core(core_), control(control_), motion_size(motion_size_), size(motion_size_) {
@@ -17,7 +17,7 @@ System::System(Core& core_, Control& control_, int motion_size_)
 
 void System::append(Integrand& appended) {
   integrand = &appended, size = motion_size + appended.size();
-  crosses_singularities = false;  // there the columns have no limit
+  crosses_singularities = false;  // sensitivities diverge at singular positions
 }
 
 bool System::rhs(double t, In y, Out y_dot) {

@@ -13,7 +13,8 @@ namespace ckc {
 constexpr double chart_margin = 1e-5;
 
 struct Counts {
-  long newton = 0, factorizations = 0, switches = 0;
+  long newton = 0, factorizations = 0;
+  long switches = 0;     // changes of the partition
   long differences = 0;  // Jacobians by finite differences
   long general_rhs = 0;  // right-hand sides for which the compiled elimination was not accurate enough
 };
@@ -34,7 +35,7 @@ enum class RhsFailure {
 enum class Accepted {
   unchanged,
   changed,    // y has changed but describes the same motion
-  restarted,  // y has new coordinates, so the history of steps is invalid
+  restarted,  // y has new coordinates; the history of steps is invalid
   rejected,   // the coordinates are singular here
 };
 
@@ -42,7 +43,7 @@ class System {
  public:
   System(Core& core, Control& control, int motion_size);
   virtual ~System() = default;
-  // Append an integrand to y. It has to live as long as this system.
+  // Append an integrand to y. It must outlive this system.
   void append(Integrand& integrand);
 
   // Start at t from a configuration with phi = w and velocity v' (rho q_dot, also off the manifold).
@@ -54,14 +55,14 @@ class System {
   // The same without projection, if possible.
   virtual bool sync_core_unprojected(double t, In y) { return sync_core(t, y); }
   // Read a coordinate (or its rate) from y, unprojected. False if y does not contain it.
-  virtual bool read_from_state(In, int, bool, double&) const { return false; }
+  virtual bool read_from_state(In /*y*/, int /*k*/, bool /*of_rate*/, double& /*value*/) const { return false; }
   // Write the projected state of the core, which belongs to y, into y.
   virtual void write_projected_state(Out) const {}
   // `sync_core` at the start of a motion.
   virtual bool sync_core_at_start(double t, In y) { return sync_core(t, y); }
   // `sync_core` at the state of the last right-hand side, without a new projection.
   virtual bool sync_core_at_last_rhs(double t, In y) = 0;
-  // Set the core to the configuration of y and compute J. False if that needs more than y.
+  // Set the core to the configuration of y and compute J. False if y does not contain the configuration.
   virtual bool set_core_configuration(In) { return false; }
   // Distance of q from being a singular chart, at the core's state: smallest singular value of phi_z over |J|,
   // dimensionless. Infinite if the formulation needs no q.
@@ -110,8 +111,8 @@ class System {
   const Vector& applied_force(In v);
   // Acceleration of the tree at the core's state, with holding forces on locked joints.
   bool acceleration(double t, Out a);
-  // Compute the derivatives of that acceleration; the core must be at this state, unless terms are compiled and no joint
-  // is locked. `correction` is added to J_dot v. False if the applied force has no known derivatives.
+  // Compute the derivatives of that acceleration. The core must be at this state unless the terms are compiled and no
+  // joint is locked. `correction` is added to J_dot v. False if the derivatives of the applied force are unknown.
   bool acceleration_derivatives(In q_tree, In v, In correction);
   bool acceleration_derivatives(In q_tree, In v) { return acceleration_derivatives(q_tree, v, zero_correction_); }
   // The derivatives that were computed last, without by_u; null if finite differences have taken their place since.
@@ -132,10 +133,10 @@ class System {
   Integrand* integrand = nullptr;
   Counts counts;
   EliminationCheck elimination;
-  bool crosses_singularities = false;  // singular positions are crossed
-  bool may_change_partition = false;   // q may change
-  Vector velocity;                     // (n)
-  Vector v_tree;                       // velocity that C uses, (n)
+  bool crosses_singularities = false;  // whether collocation steps cross singular positions
+  bool may_change_partition = false;   // whether accept_step may choose another q
+  Vector velocity;                     // of the tree, (n)
+  Vector v_tree;                       // velocity at which C is evaluated, (n)
   Vector w;                            // prescribed value of phi, (rows)
   Vector q, q_dot;                     // (d)
 
@@ -156,7 +157,7 @@ class System {
   // Eq. 1 at the core's state with velocity v, including holding forces. `correction` is added to J_dot v.
   bool acceleration_with_held_joints(In v, In correction, Out a);
 
-  Vector zero_correction_;        // zero, (rows)
+  Vector zero_correction_;  // (rows)
   AccelerationDerivatives eq_1_;
 
  private:
@@ -164,7 +165,6 @@ class System {
   std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
   Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_;
   AppliedForce force_;
-
   Matrix responses_;
 };
 

@@ -1,4 +1,4 @@
-// Jumps of the sensitivities where a velocity or an acceleration jumps (saltation).
+// Jumps of the sensitivities at events where a velocity or an acceleration jumps (saltation).
 #include <algorithm>
 #include <cmath>
 
@@ -8,9 +8,9 @@
 
 namespace ckc {
 
-// relative tolerances for comparing times of events: bounds, and a factor of the integration tolerance
+// Relative tolerance for comparing times of events: its bounds, and its ratio to the integration tolerance.
 constexpr double min_relative_tolerance = 1e-7, max_relative_tolerance = 1e-2, tolerance_factor = 100.0;
-constexpr double rate_rounding = 1e-9;  // of the fastest coordinate: below it a coordinate is at rest
+constexpr double rate_rounding = 1e-9;  // relative to the fastest coordinate; slower coordinates are at rest
 
 Vector Sensitivities::time_shift(const JointArrival& arrival, In v, In a, const Matrix& s) const {
   const int k = arrival.coordinate;
@@ -18,8 +18,8 @@ Vector Sensitivities::time_shift(const JointArrival& arrival, In v, In a, const 
   return -distance_from_stop_derivative(arrival, s) / core_.tree.coordinate_change(core_.q_tree, k, v);
 }
 
-// Project the sensitivities onto what loops and locked joints allow, minimum-norm in the metric of D'. They drift
-// within the tolerances. Joints that move only together would otherwise stop at different times.
+// Project the sensitivities onto the tangent space of loops and locked joints, minimum-norm in the metric of D'. They
+// drift within the tolerances. Otherwise joints that move only together would stop at different times.
 bool Sensitivities::project_sensitivities(In v, Matrix& s) {
   const int m = core_.constraints.closure.rows;
   const Vector none = Vector::Zero(n), no_force = Vector::Zero(m);
@@ -67,9 +67,9 @@ void Sensitivities::shift_time(In v, In a, double sign, Matrix& s) const {
   }
 }
 
-// Shift the sensitivities to the time of the event, which depends on the parameters. Of several simultaneous arrivals
-// the fastest one defines the time, and a stop takes precedence over coming to rest. Unconnected parts of the
-// mechanism have independent times: the order of their events does not matter.
+// Shift the sensitivities to the time of the event, which depends on the parameters. The fastest of simultaneous
+// arrivals defines the time; arrivals at stops take precedence over arrivals at rest. Unconnected parts of the
+// mechanism have independent times, because the order of their events does not matter.
 bool Sensitivities::before_transition(In v, In a, const std::vector<JointArrival>& arrivals, Matrix& s) {
   const Vector& reach = core_.joints.table.reach;
   const auto speed = [&](const JointArrival& of) {
@@ -96,7 +96,7 @@ bool Sensitivities::before_transition(In v, In a, const std::vector<JointArrival
   return s.allFinite();
 }
 
-// A joint that rests while another one changes its mode, or that has just reversed, does not change its mode.
+// A joint that stays at rest while another one changes its mode, or that reverses, does not change its mode.
 bool Sensitivities::mode_changed(const JointArrival& arrival) const {
   const Joints& joints = core_.joints;
   const int k = arrival.coordinate;
@@ -105,9 +105,10 @@ bool Sensitivities::mode_changed(const JointArrival& arrival) const {
          joints.sliding_direction[k] != previous_direction_[k] || joints.stop_side[k] != previous_stop_side_[k];
 }
 
-// Each parameter is compared with the largest norm that its column has had: digits lost there stay lost.
-std::optional<NonDifferentiableEvent> Sensitivities::find_non_differentiable(
-    const std::vector<JointArrival>& arrivals, const Matrix& s, double rtol, double atol) {
+// Tolerances are relative to the largest norm that the column has had, because digits that were lost there stay lost.
+std::optional<NonDifferentiableEvent> Sensitivities::find_non_differentiable(const std::vector<JointArrival>& arrivals,
+                                                                             const Matrix& s, double rtol,
+                                                                             double atol) {
   const double relative = std::clamp(tolerance_factor * rtol, min_relative_tolerance, max_relative_tolerance);
   record_column_sizes(s);
   for (const auto& [k, unreached] : unreached_rates_)
@@ -156,8 +157,9 @@ std::optional<NonDifferentiableEvent> Sensitivities::find_marginally_locked(doub
   return first;
 }
 
-// A joint that sticks or touches from here on is stopped by its holding force, whenever it arrives. If that takes a
-// short slide or a series of ever smaller bounces, their time and distance vanish with the arrival rate.
+// A joint that sticks or touches from here on is stopped by its holding force at any parameter value. For other
+// values a short slide or a series of ever smaller bounces may come first. Its time and distance vanish with the
+// arrival rate.
 void Sensitivities::after_transition(In v, In a, Matrix& s) {
   was_at_limit_.clear();
   torque_limit_side_.clear();  // torques may jump together with the velocity
@@ -174,17 +176,18 @@ bool Sensitivities::at_impact(In v, In step, const Indices& at, const Matrix& re
   Vector lambda = Vector::Zero(m), residual_force(n);
   core_.compute_D_tree();
   core_.multiply_D_tree(step, residual_force);
-  Indices pushing;
+  Indices active_stops;
   for (size_t i = 0; i < at.size(); ++i) {
     const auto k = static_cast<Eigen::Index>(i);
     residual_force(at[i]) -= x(k);
     was_struck_[at[i]] = 1;
-    // A stop is active if it pushes. Comparing the impulse with the deviation from the restitution law tells which is
-    // rounding. A reversed joint is active too, even if others that move only with it take the impulse.
-    const double before = v(at[i]), after = before + step(at[i]), faster = std::abs(after + restitution * before);
-    const bool turned = has_defined_time(at[i], false, v, v) && before * step(at[i]) < 0.0;
-    if (std::abs(x(k)) * responses(at[i], k) > faster || (turned && faster <= rate_rounding * std::abs(before)))
-      pushing.push_back(static_cast<int>(i));
+    // A stop is active if it pushes. Either its impulse or its deviation from the restitution law is rounding; a
+    // comparison tells which. A reversed joint is active too, even if joints that move only with it take the impulse.
+    const double before = v(at[i]), after = before + step(at[i]);
+    const double deviation = std::abs(after + restitution * before);
+    const bool reversed = has_defined_time(at[i], false, v, v) && before * step(at[i]) < 0.0;
+    if (std::abs(x(k)) * responses(at[i], k) > deviation || (reversed && deviation <= rate_rounding * std::abs(before)))
+      active_stops.push_back(static_cast<int>(i));
   }
   core_.minimum_norm_multipliers(residual_force, lambda);
   compute(none, step, lambda, true);
@@ -194,16 +197,16 @@ bool Sensitivities::at_impact(In v, In step, const Indices& at, const Matrix& re
   positions.bottomRows(n).setZero();
   add_state_derivatives(positions);
   if (!core_.solve_acceleration_derivatives(-force_, row_, derivative_)) return false;
-  const auto pushing_count = static_cast<Eigen::Index>(pushing.size());
-  Matrix A(pushing_count, pushing_count), target_rates(pushing_count, count), columns(n, pushing_count);
-  Vector scale(pushing_count);
-  for (Eigen::Index i = 0; i < pushing_count; ++i) {
-    const int k = at[pushing[i]];
-    columns.col(i) = responses.col(pushing[i]);
-    for (Eigen::Index j = 0; j < pushing_count; ++j) A(i, j) = responses(k, pushing[j]);
+  const auto active_count = static_cast<Eigen::Index>(active_stops.size());
+  Matrix A(active_count, active_count), target_rates(active_count, count), columns(n, active_count);
+  Vector scale(active_count);
+  for (Eigen::Index i = 0; i < active_count; ++i) {
+    const int k = at[active_stops[i]];
+    columns.col(i) = responses.col(active_stops[i]);
+    for (Eigen::Index j = 0; j < active_count; ++j) A(i, j) = responses(k, active_stops[j]);
     scale(i) = 1.0 / std::sqrt(A(i, i));
     // direction away from the stop
-    const double side = x(pushing[i]) > 0.0 || (x(pushing[i]) == 0.0 && v(k) < 0.0) ? 1.0 : -1.0;
+    const double side = x(active_stops[i]) > 0.0 || (x(active_stops[i]) == 0.0 && v(k) < 0.0) ? 1.0 : -1.0;
     target_rates.row(i) = -(1.0 + restitution) * s.row(n + k) - derivative_.row(k);
     for (int p = 0; p < count; ++p)
       for (const ParameterDerivative& of : table_.parameters[p].derivatives)
@@ -212,14 +215,14 @@ bool Sensitivities::at_impact(In v, In step, const Indices& at, const Matrix& re
           target_rates(i, p) += side * std::max(-side * v(k), 0.0);
   }
   A = scale.asDiagonal() * A * scale.asDiagonal(), target_rates = scale.asDiagonal() * target_rates;
-  Eigen::CompleteOrthogonalDecomposition<Matrix> solver(pushing_count, pushing_count);
+  Eigen::CompleteOrthogonalDecomposition<Matrix> solver(active_count, active_count);
   solver.setThreshold(dependent_row_tolerance).compute(A);
   const Matrix impulse = solver.solve(target_rates);
   s.bottomRows(n) += derivative_ + columns * scale.asDiagonal() * impulse;
-  // Joints that move only together are reflected by different stops. Changing a restitution would let another one
-  // take over.
+  // Nonzero if joints that move only together are reflected by different stops: after a small change of a restitution,
+  // another stop would determine the motion.
   const Matrix unreached = scale.cwiseInverse().asDiagonal() * (A * impulse - target_rates);
-  for (Eigen::Index i = 0; i < pushing_count; ++i) unreached_rates_.emplace_back(at[pushing[i]], unreached.row(i));
+  for (Eigen::Index i = 0; i < active_count; ++i) unreached_rates_.emplace_back(at[active_stops[i]], unreached.row(i));
   return s.allFinite();
 }
 

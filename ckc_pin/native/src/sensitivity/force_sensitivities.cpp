@@ -11,7 +11,7 @@ namespace ckc {
 // With R = rho in those coordinates, du = R^T (df + d(J^T) lambda). For motors, f = T^T tau.
 void Sensitivities::force_sensitivities(In v, const Matrix& s, Matrix& u, Matrix& tau) {
   const Control& control = system_.control;
-  const auto d = static_cast<Eigen::Index>(table_.fixed_q.size()), motors = table_.turns.rows();
+  const auto d = static_cast<Eigen::Index>(table_.fixed_q.size()), motors = table_.transmission.rows();
   bool outputs_torques = control.outputs_torques();
   u.setZero(d, count), tau.setZero(motors, count);
   if (!control.is_active()) return;
@@ -57,7 +57,7 @@ void Sensitivities::force_sensitivities(In v, const Matrix& s, Matrix& u, Matrix
   positions.bottomRows(n).setZero();
   add_state_derivatives(positions);
   const Matrix parameter_force = basis.transpose() * (gear_force_ - force_),
-               transmission = basis.transpose() * table_.turns.transpose();
+               transmission = basis.transpose() * table_.transmission.transpose();
   if (outputs_torques)
     u = parameter_force + transmission * tau;
   else if (motors == d)
@@ -67,8 +67,7 @@ void Sensitivities::force_sensitivities(In v, const Matrix& s, Matrix& u, Matrix
     tau.setConstant(std::numeric_limits<double>::quiet_NaN());
 }
 
-// Derivative of the requested u, minus the parameters' effect on the motor forces without limits
-// (control/control.cpp).
+// Derivative of the requested u, minus that of the motor forces without limits (control/control.cpp).
 void Sensitivities::limited_motor_sensitivities(In v) {
   const Control& control = system_.control;
   const Vector none = Vector::Zero(n);

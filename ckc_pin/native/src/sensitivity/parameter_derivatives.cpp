@@ -141,7 +141,7 @@ void Sensitivities::add_control_derivatives(In q_tree, In v, Matrix& force) {
         force.col(p) -= torque_limit_side(k) * of.numbers;
     }
   if (motors_are_limited)
-    force.noalias() -= table_.turns.transpose() * limited_tau_;
+    force.noalias() -= table_.transmission.transpose() * limited_tau_;
   else
     add_requested_u(q_tree, v, force);
 }

@@ -8,7 +8,7 @@
 
 namespace ckc {
 
-constexpr double min_relative_stiffness = 1e-12;  // relative stiffness below which an equilibrium is neutral
+constexpr double min_relative_stiffness = 1e-12;  // below it an equilibrium is not isolated
 
 static bool is_applied(const ParameterDerivative& of) {
   return of.kind == ParameterDerivative::friction || of.kind == ParameterDerivative::gain_q ||
@@ -48,17 +48,17 @@ void Sensitivities::compute(In v, In a, In lambda, bool impulsive) {
   derivatives_.compute(q_, v_, a_, lambda, impulsive);
 }
 
-// Add to x the step of z with J x = -open.
-void Sensitivities::solve_dependent(const Matrix& open, Matrix& x) {
+// Add to x the step of z that reduces the residuals to zero.
+void Sensitivities::solve_dependent(const Matrix& residuals, Matrix& x) {
   Vector step(n);
   for (int p = 0; p < count; ++p) {
-    core_.closure_step_in_z(open.col(p), step);
+    core_.closure_step_in_z(residuals.col(p), step);
     x.col(p) += step;
   }
 }
 
-// At rest at the core's configuration, with the sensitivities of q given: derivative of the force on q that keeps it
-// in equilibrium, and the stiffness.
+// At rest at the core's configuration, with given sensitivities of the independent coordinates: complete these, and
+// compute the stiffness and the derivative of the force on q that keeps the mechanism in equilibrium.
 void Sensitivities::compute_balance(Matrix& q, Matrix& force_derivative, Matrix& stiffness) {
   const Vector none = Vector::Zero(n);
   Vector lambda = Vector::Zero(core_.constraints.closure.rows), u(core_.d);
@@ -80,8 +80,8 @@ void Sensitivities::compute_balance(Matrix& q, Matrix& force_derivative, Matrix&
   stiffness = core_.rho.transpose() * by_q * core_.rho;
 }
 
-// Parameters define the initial sensitivities of the independent coordinates. Those of the others follow from the
-// closure.
+// Parameters define the initial sensitivities of the independent coordinates. The sensitivities of the dependent ones
+// follow from the closure.
 bool Sensitivities::start(In v, Matrix& s) {
   compiled_evaluations = general_evaluations = 0;
   queued_.clear(), held_output_.resize(0, 0);
@@ -223,9 +223,9 @@ void Sensitivities::prepare_compiled() {
 
 // Assemble the direction of parameter p for the compiled terms. force_ contains derivatives of the applied force if
 // `force_changes`.
-void Sensitivities::direction(const Eigen::Ref<const Matrix>& s, int p, bool force_changes, Out to) {
-  to.head(2 * n) = s.col(p);
-  auto added = to.tail(group_direction_.size());
+void Sensitivities::assemble_direction(const Eigen::Ref<const Matrix>& s, int p, bool force_changes, Out direction) {
+  direction.head(2 * n) = s.col(p);
+  auto added = direction.tail(group_direction_.size());
   added.setZero();
   if (force_changes) added.head(n) = force_.col(p);
   for (int parameter_group : parameter_groups_[static_cast<size_t>(p)]) {
@@ -245,12 +245,12 @@ bool Sensitivities::compiled_rates(In q_tree, In v, const Eigen::Ref<const Matri
   configuration_rate_sensitivities(v, s, s_dot);
   for (DirectionGroup& group : direction_groups_) {
     if (group.directions.rows() == 1) {
-      direction(s, group.first, force_changes, direction_);
+      assemble_direction(s, group.first, force_changes, direction_);
       core_.compiled->directional_derivative(direction_, s_dot.col(group.first).tail(n));
       continue;
     }
     for (int row = 0; row < group.count; ++row) {
-      direction(s, group.first + row, force_changes, direction_);
+      assemble_direction(s, group.first + row, force_changes, direction_);
       group.directions.row(row) = direction_;
     }
     core_.compiled->directional_derivatives(group.directions, group.derivatives);

@@ -59,7 +59,7 @@ bool SensitivityIntegrand::general_rates(In y, In y_dot) {
   return true;
 }
 
-// The Newton iteration neglects how the columns depend on the motion.
+// Newton's iteration neglects the dependence of the columns on the motion.
 bool SensitivityIntegrand::jacobian(In y, Matrix& of_column) {
   Core& core = system_.core;
   if (!system_.eq_1_derivatives()) {  // finite differences have moved the core

@@ -15,7 +15,7 @@ class SensitivityIntegrand final : public Integrand {
   Vector time_shift(const JointArrival& arrival, In y, In a) const;
 
   Sensitivities sensitivities;
-  // set if the motion is not differentiable from here on
+  // Set if the motion is not differentiable from here on.
   std::optional<NonDifferentiableEvent> non_differentiable_event;
   double impact_at = std::numeric_limits<double>::quiet_NaN();  // s, time of the last impact
 
@@ -34,19 +34,17 @@ class SensitivityIntegrand final : public Integrand {
   void fill_record(In y, Out row) override;
 
  private:
-  Eigen::Map<const Matrix> columns(In y) const {
-    return {y.data() + system_.motion_size, rows_, sensitivities.count};
-  }
+  Eigen::Map<const Matrix> columns(In y) const { return {y.data() + system_.motion_size, rows_, sensitivities.count}; }
   void load(In y) { s_ = columns(y); }
   void store(Out y) const { y.segment(system_.motion_size, size()) = s_.reshaped(); }
   bool general_rates(In y, In y_dot);  // by Pinocchio's terms
 
   System& system_;
   const int rows_;                 // of a column, 2 n
-  const bool only_initial_state_;  // all parameters act on the initial state only
+  const bool only_initial_state_;  // whether all parameters act on the initial state only
   Matrix s_, s_dot_, u_, tau_;
   Vector v_, a_;
-  double transition_time_ = 0.0;  // s, time of the present joint transition
+  double transition_time_ = 0.0;  // s, of the present joint transition
 };
 
 }  // namespace ckc

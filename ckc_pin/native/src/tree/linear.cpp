@@ -11,8 +11,8 @@ namespace ckc {
 // Smaller matrices are factorized densely: searching for the nonzero entries would cost more.
 constexpr int max_dense_rows = 6;
 
-void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
-  rows_ = rows, columns_ = columns, pattern_ = pattern, small_ = rows == columns && rows <= max_dense_rows;
+void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& pattern) {
+  rows_ = rows, columns_ = columns, pattern_ = pattern, is_small_ = rows == columns && rows <= max_dense_rows;
   Indices first(columns, rows);
   for (int i = rows - 1; i >= 0; --i)
     for (int j : pattern[i]) first[j] = i;
@@ -27,9 +27,9 @@ void Factor::shape(int rows, int columns, const std::vector<Indices>& pattern) {
     for (auto& eliminated : eliminated_rows_) eliminated.reserve(rows);
     active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
-      int low = rows;
-      for (int j : pattern[i]) low = std::min(low, position_of_[j]);
-      if (low < rows) rows_starting_at_[low].push_back(i);
+      int first_column = rows;
+      for (int j : pattern[i]) first_column = std::min(first_column, position_of_[j]);
+      if (first_column < rows) rows_starting_at_[first_column].push_back(i);
     }
   } else {
     qr_.setZero(rows, columns);
@@ -44,7 +44,7 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
     for (int j = 0; j < columns_; ++j) qr_.col(j) = a.col(at(j));
     return householder();
   }
-  if (small_) {
+  if (is_small_) {
     for (int i = 0; i < rows_; ++i)
       for (int k = 0; k < rows_; ++k) lu_(i, k) = a(i, at(column_at_[k]));
     return eliminate_small();
@@ -61,10 +61,10 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
   eliminate();
 }
 
-void DefiniteFactor::shape(int size) {
+void DefiniteFactor::resize(int size) {
   is_small_ = size <= max_dense_rows;
   if (is_small_)
-    small_.shape(size, size, full_pattern(size));
+    small_.set_pattern(size, size, full_pattern(size));
   else
     // A solver that has computed nothing cannot be moved, so use it once.
     large_.compute(Matrix::Identity(size, size));
@@ -80,9 +80,9 @@ void DefiniteFactor::solve(In b, Out x) {
 }
 
 std::vector<Indices> full_pattern(int size) {
-  Indices every(size);
-  std::iota(every.begin(), every.end(), 0);
-  return std::vector<Indices>(size, every);
+  Indices all_columns(size);
+  std::iota(all_columns.begin(), all_columns.end(), 0);
+  return std::vector<Indices>(size, all_columns);
 }
 
 void Factor::eliminate() {
@@ -138,12 +138,12 @@ void Factor::eliminate_small() {
 }
 
 double Factor::pivot_ratio() const {
-  double least = std::numeric_limits<double>::infinity(), most = 0.0;
+  double smallest = std::numeric_limits<double>::infinity(), largest = 0.0;
   for (int k = 0; k < columns_; ++k) {
     const double pivot = std::abs(rows_ == columns_ ? lu_(row_at_[k], k) : qr_(k, k));
-    least = std::min(least, pivot), most = std::max(most, pivot);
+    smallest = std::min(smallest, pivot), largest = std::max(largest, pivot);
   }
-  return columns_ ? least / most : 1.0;
+  return columns_ ? smallest / largest : 1.0;
 }
 
 void Factor::householder() {
@@ -184,7 +184,7 @@ void Factor::solve(In b, Out x) {
     x = work_.head(columns_);
     return;
   }
-  if (small_) {
+  if (is_small_) {
     for (int k = 0; k < rows_; ++k) {
       const double* row = &lu_(row_at_[k], 0);
       double value = b(row_at_[k]);

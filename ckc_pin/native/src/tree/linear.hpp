@@ -14,8 +14,8 @@ namespace ckc {
 // then cost as much as each one alone, and a chain of loops costs as much as a banded matrix.
 class Factor {
  public:
-  // Set the sparsity pattern of a (rows, columns) matrix. Columns are sorted by the first row that involves them.
-  void shape(int rows, int columns, const std::vector<Indices>& pattern);
+  // Set the size of the matrices and their sparsity pattern: by row, the columns that are not zero.
+  void set_pattern(int rows, int columns, const std::vector<Indices>& pattern);
   // Factorize the given columns of a matrix (all if `columns` is empty). Entries outside the pattern must be zero.
   void compute(const Matrix& a, const Indices& columns = {});
   void solve(In b, Out x);             // least squares if the matrix is tall
@@ -30,22 +30,23 @@ class Factor {
 
   int rows_ = 0, columns_ = 0;
   std::vector<Indices> pattern_;
-  Indices column_at_;    // column_at_[k]: column of the matrix that is eliminated k-th
+  Indices column_at_;    // column_at_[k]: column of the matrix that is eliminated as the k-th
   Indices position_of_;  // inverse of column_at_
   Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
   Matrix qr_;
   Vector tau_, work_;
-  Indices row_end_, row_at_;               // ends of the intervals; rows in pivot order
+  Indices row_end_;                        // by row: end of its interval
+  Indices row_at_;                         // rows in pivot order
   std::vector<Indices> rows_starting_at_;  // by column: rows whose interval begins there
   std::vector<Indices> eliminated_rows_;   // by column: rows that its elimination changed
   Indices active_rows_;                    // rows that have started and are not yet pivots
-  bool small_ = false, singular_ = false;
+  bool is_small_ = false, singular_ = false;
 };
 
 // Cholesky factorization of a symmetric positive definite matrix. Small matrices use LU instead, which is faster.
 class DefiniteFactor {
  public:
-  void shape(int size);
+  void resize(int size);
   void compute(const Matrix& a);
   void solve(In b, Out x);
 

@@ -4,7 +4,7 @@ namespace ckc {
 
 namespace {
 
-constexpr double max_series_squared_angle = 1.0;  // |u|^2 up to which the series is used; it converges up to (2 pi)^2
+constexpr double max_series_squared_angle = 1.0;  // rad^2; the series converges up to |u|^2 = (2 pi)^2
 // Coefficients of c = (1 - x/2 cot(x/2)) / x^2 in powers of x^2: |B_2k| / (2k)!.
 constexpr double series[] = {1.0 / 12,
                              1.0 / 720,

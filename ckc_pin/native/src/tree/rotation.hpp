@@ -22,7 +22,7 @@ class LogJacobian {
  private:
   Vector3 u_;
   Matrix3 s_;
-  double c_, c_rate_, c_second_;  // c(x), c'(x)/x, and the same operation applied to that
+  double c_, c_rate_, c_second_;  // c(x), b(x) = c'(x)/x, and b'(x)/x, with x = |u|
 };
 
 }  // namespace ckc

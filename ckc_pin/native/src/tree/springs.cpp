@@ -25,15 +25,15 @@ void Springs::update_flags() {
   has_damping = !s.damping.isZero(0) || !s.joint_damping.isZero(0);
 }
 
-void Springs::set_parameters(Parameter what, In numbers) {
-  if (what == Parameter::end) {
-    for (size_t k = 0; k < table.point_local.size(); ++k) table.point_local[k] = numbers.segment<3>(3 * k);
+void Springs::set_parameters(Parameter parameter, In values) {
+  if (parameter == Parameter::end) {
+    for (size_t k = 0; k < table.point_local.size(); ++k) table.point_local[k] = values.segment<3>(3 * k);
     return;
   }
   Vector* parts[] = {
       nullptr,           &table.stiffness,     &table.rest_length, &table.damping, &table.joint_stiffness,
       &table.joint_rest, &table.joint_damping, &table.constant};
-  *parts[static_cast<int>(what)] = numbers;
+  *parts[static_cast<int>(parameter)] = values;
   update_flags();
 }
 

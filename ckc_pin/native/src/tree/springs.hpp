@@ -21,7 +21,8 @@ class Springs {
   Eigen::Index count() const { return count_; }
 
   enum class Parameter { end, stiffness, rest_length, damping, joint_stiffness, joint_rest, joint_damping, constant };
-  void set_parameters(Parameter what, In numbers);
+  // Replace one kind of parameter for all springs, coordinates, or ends (A of all springs, then B).
+  void set_parameters(Parameter parameter, In values);
 
   void update_lengths(const Tree& tree);  // requires the tree's placements and Jacobian
   void add_elastic_force(const Tree& tree, In q, Out force) const;
@@ -29,7 +30,7 @@ class Springs {
   double energy(const Tree& tree, In q) const;
 
  private:
-  void update_flags();  // has_elastic_forces, has_damping
+  void update_flags();  // sets has_elastic_forces and has_damping
 
   int count_;
   std::vector<Indices> pattern_;

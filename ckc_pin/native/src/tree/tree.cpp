@@ -24,7 +24,7 @@ struct Tree::Workspace {
   explicit Workspace(pin::Model&& loaded) : model(std::move(loaded)), data(model) {}
 };
 
-static pin::Model read(const std::string& serialized) {
+static pin::Model load_model(const std::string& serialized) {
   pin::Model model;
   boost::asio::streambuf buffer;
   buffer.sputn(serialized.data(), static_cast<std::streamsize>(serialized.size()));
@@ -33,7 +33,7 @@ static pin::Model read(const std::string& serialized) {
 }
 
 Tree::Tree(const std::string& serialized, Indices q_index_) : q_index(std::move(q_index_)) {
-  workspace_ = std::make_unique<Workspace>(read(serialized));
+  workspace_ = std::make_unique<Workspace>(load_model(serialized));
   const pin::Model& model = workspace_->model;
   n = model.nv, nq = model.nq, joints = model.njoints;
   support.resize(joints);
@@ -54,18 +54,18 @@ Tree::Tree(const std::string& serialized, Indices q_index_) : q_index(std::move(
 
 Tree::~Tree() = default;
 
-void Tree::set_parameters(Parameter what, In numbers) {
+void Tree::set_parameters(Parameter parameter, In values) {
   pin::Model& model = workspace_->model;
-  const auto three = [&](int joint) { return Vector3(numbers.segment<3>(3 * joint)); };
-  if (what == Parameter::gravity) model.gravity.linear() = three(0);
-  if (what == Parameter::armature) model.armature = numbers;
+  const auto vector_of = [&](int joint) { return Vector3(values.segment<3>(3 * joint)); };
+  if (parameter == Parameter::gravity) model.gravity.linear() = vector_of(0);
+  if (parameter == Parameter::armature) model.armature = values;
   for (int joint = 0; joint < joints; ++joint) {
     pin::Inertia& body = model.inertias[joint];
-    if (what == Parameter::offset) model.jointPlacements[joint].translation() = three(joint);
-    if (what == Parameter::mass) body.mass() = numbers(joint);
-    if (what == Parameter::centre) body.lever() = three(joint);
-    if (what == Parameter::inertia)
-      body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(numbers.data() + 9 * joint)));
+    if (parameter == Parameter::offset) model.jointPlacements[joint].translation() = vector_of(joint);
+    if (parameter == Parameter::mass) body.mass() = values(joint);
+    if (parameter == Parameter::centre) body.lever() = vector_of(joint);
+    if (parameter == Parameter::inertia)
+      body.inertia() = pin::Symmetric3(Matrix3(Eigen::Map<const Matrix3>(values.data() + 9 * joint)));
   }
 }
 
@@ -90,7 +90,7 @@ Vector6 Tree::velocity(int joint) const {
 }
 
 Vector6 Tree::bias_acceleration(int joint) const {
-  // nonLinearEffects represents gravity as an upward acceleration of the world; undo that.
+  // nonLinearEffects represents gravity by an upward acceleration of the world. Remove it.
   return workspace_->data.oMi[joint].act(workspace_->data.a_gf[joint]).toVector() +
          workspace_->model.gravity.toVector();
 }
@@ -156,12 +156,12 @@ void Tree::normalize(Out q) const {
 void Tree::integrate(Out q, In step) const {
   for (int k : single_dof) q(q_index[k]) += step(k);
   for (const Root& root : roots) {
-    const pin::SE3 there = placement(q, root) * pin::exp6(pin::Motion(step.segment<6>(root.v)));
-    Eigen::Quaterniond orientation(there.rotation());
+    const pin::SE3 next_placement = placement(q, root) * pin::exp6(pin::Motion(step.segment<6>(root.v)));
+    Eigen::Quaterniond orientation(next_placement.rotation());
     orientation.normalize();
     // Of the two quaternions of this rotation, take the one closer to the previous.
     if (orientation.dot(orientation_of(q, root)) < 0) orientation.coeffs() *= -1;
-    q.segment<3>(root.q) = there.translation();
+    q.segment<3>(root.q) = next_placement.translation();
     q.segment<4>(root.q + 3) = orientation.coeffs();
   }
 }
@@ -189,14 +189,14 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
   }
 }
 
-// The same as in `ckc_pin.mechanism.tree`.
+// As in `ckc_pin.mechanism.tree`.
 double Tree::tolerance_scale(In q, In units) const {
-  constexpr double many = 100.0, most = 1e4;
+  constexpr double large_coordinate = 100.0, max_factor = 1e4;
   double largest = 0.0;
   for (int k : single_dof) largest = std::max(largest, std::abs(q(q_index[k])) / units(k));
   for (const Root& root : roots)
     largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
-  return std::clamp(largest / many, 1.0, most);
+  return std::clamp(largest / large_coordinate, 1.0, max_factor);
 }
 
 Matrix Tree::q_dot_to_tangent(In q) const {
@@ -233,10 +233,10 @@ Matrix Tree::configuration_rate_derivative(In q, In v) const {
 
 void Tree::add_bracket(In v, In x, Out sum) const {
   for (const Root& root : roots) {
-    const Vector3 slide = v.segment<3>(root.v), spin = v.segment<3>(root.v + 3);
-    const Vector3 moved = x.segment<3>(root.v), orientation_of = x.segment<3>(root.v + 3);
-    sum.segment<3>(root.v) += spin.cross(moved) + slide.cross(orientation_of);
-    sum.segment<3>(root.v + 3) += spin.cross(orientation_of);
+    const Vector3 v_linear = v.segment<3>(root.v), v_angular = v.segment<3>(root.v + 3);
+    const Vector3 x_linear = x.segment<3>(root.v), x_angular = x.segment<3>(root.v + 3);
+    sum.segment<3>(root.v) += v_angular.cross(x_linear) + v_linear.cross(x_angular);
+    sum.segment<3>(root.v + 3) += v_angular.cross(x_angular);
   }
 }
 
@@ -253,11 +253,11 @@ Vector6 Tree::twist_to(In q, Root root, const Matrix3& orientation, const Vector
   return pin::log6(placement(q, root).actInv(pin::SE3(orientation, position))).toVector();
 }
 
-void Tree::to_coordinates(In q, Out numbers) const {
-  for (int k : single_dof) numbers(k) = q(q_index[k]);
+void Tree::to_coordinates(In q, Out coordinates) const {
+  for (int k : single_dof) coordinates(k) = q(q_index[k]);
   for (const Root& root : roots) {
-    numbers.segment<3>(root.v) = q.segment<3>(root.q);
-    numbers.segment<3>(root.v + 3) = pin::log3(orientation_of(q, root).toRotationMatrix());
+    coordinates.segment<3>(root.v) = q.segment<3>(root.q);
+    coordinates.segment<3>(root.v + 3) = pin::log3(orientation_of(q, root).toRotationMatrix());
   }
 }
 

@@ -17,9 +17,10 @@ class Tree {
 
   int n, nq, joints;
   Indices q_index;  // (n)
+  // A free root: index of its first coordinate in q' (seven: position, quaternion) and in v' (six: twist).
   struct Root {
     int q, v;
-  };  // where the seven numbers and the six velocities of a free root begin
+  };
   std::vector<Root> roots;
   Indices single_dof;              // tangent coordinates of joints with one degree of freedom
   std::vector<Indices> support;    // by joint: the tangent coordinates that move it, ascending
@@ -27,9 +28,9 @@ class Tree {
   Indices joint_of;                // by coordinate: its joint
   Indices parent;                  // by joint
 
-  // Replace one kind of parameter for all joints. `numbers`: concatenated by joint.
+  // Replace one kind of parameter for all joints; `values`: concatenated by joint (gravity: three, armature: n).
   enum class Parameter { gravity, offset, mass, centre, inertia, armature };
-  void set_parameters(Parameter what, In numbers);
+  void set_parameters(Parameter parameter, In values);
 
   // Factor (at least one) by which closure tolerances grow at q: large coordinates carry larger rounding errors.
   double tolerance_scale(In q, In units) const;
@@ -60,7 +61,7 @@ class Tree {
   void compute_derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v);
   Vector6 acceleration(int joint) const;  // without gravity; requires `compute_derivatives`
   Matrix6 spatial_inertia(int joint) const;
-  Vector6 spatial_gravity() const;  // spatial vector
+  Vector6 spatial_gravity() const;  // (linear, angular), m/s^2
   struct Body {
     double mass;
     Vector3 centre;
@@ -69,20 +70,20 @@ class Tree {
   Body body(int joint) const;  // in world axes, the inertia about the centre of mass
   const Vector& armature() const;
 
-  // Operations on q' itself. A free root has a position and a unit quaternion, and moves by a twist in its own axes.
+  // Operations on q'. A free root has a position and a unit quaternion, and moves by a twist in its own axes.
   void normalize(Out q) const;
   void integrate(Out q, In step) const;  // q <- q + step, in tangent coordinates
   void difference(In from, In to, Out step) const;
   void difference_rate(In from, In to, In v, Out rate) const;  // d/dt of `difference` where `to` moves with v
   void configuration_rate(In q, In v, Out q_dot) const;
-  Matrix q_dot_to_tangent(In q) const;  // (n, nq): maps a change of q' to a tangent step
+  Matrix q_dot_to_tangent(In q) const;  // (n, nq): maps a small step of q' to a tangent step
   // (nq, n): derivative of `configuration_rate` with respect to tangent steps
   Matrix configuration_rate_derivative(In q, In v) const;
   // The rate of a tangent step x along a motion v: x_dot = delta_v - bracket_matrix(v) x. Zero without free roots.
   Matrix bracket_matrix(In v) const;                     // (n, n)
   void add_bracket(In v, In x, Out sum) const;           // sum += bracket_matrix(v) x
-  void to_coordinates(In q, Out numbers) const;          // (n); rotations as rotation vectors
-  double coordinate_change(In q, int k, In step) const;  // change of coordinate k for a tangent step
+  void to_coordinates(In q, Out coordinates) const;      // (n); rotations as rotation vectors
+  double coordinate_change(In q, int k, In step) const;  // of the k-th of these coordinates, for a tangent step
   Matrix3 orientation(In q, Root root) const;
   // Twist, in the free root's axes, that moves it to another placement.
   Vector6 twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const;

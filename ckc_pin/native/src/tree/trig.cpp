@@ -11,7 +11,7 @@ namespace ckc {
 
 namespace {
 
-constexpr Eigen::Index lanes = 4;
+constexpr Eigen::Index lanes = 4;  // numbers per vector function call
 
 void evaluate_scalar(const double* x, Eigen::Index count, double* cosines, double* sines) {
   for (Eigen::Index k = 0; k < count; ++k) cosines[k] = std::cos(x[k]);
