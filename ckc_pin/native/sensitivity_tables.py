@@ -35,7 +35,7 @@ __all__ = [
 
 PlacedKind = Literal["joint", "point", "spring", "direction", "log_a", "log_b", "reported"]
 
-NOT_TERMS = (  # kinds that change what acts or what joints do, but not the terms of eq. 1
+NOT_TERMS = (  # kinds of friction, stops, controllers and motors, on which the terms of eq. 1 do not depend
     "friction",
     "gain_q",
     "gain_q_dot",
@@ -55,14 +55,14 @@ class PlacementJoint:
     Attributes
     ----------
     placed : str
-        What it carries: a joint, a point of a loop, an end of a spring, a direction, a frame of a relative rotation,
-        or a point that is only reported.
+        Kind of the object that it carries: a joint, a point of a loop, an end of a spring, a direction, a frame of a
+        relative rotation, or a reported point.
     carrier : int
         Index of the joint that carries it.
     axis : (3,) array
         Unit vector in the carrier's axes, through its origin.
     revolute : bool
-        It turns about the axis; otherwise it slides along it.
+        Whether it rotates about the axis; otherwise it slides along it.
     """
 
     placed: PlacedKind
@@ -113,6 +113,7 @@ class SensitivityParameter:
     ----------
     name : str
     derivatives : tuple of ParameterDerivative
+        Terms of the derivative of the equations of motion.
     q : (n,) array or None
         Derivative of the initial configuration, as a tangent vector.
     q_dot : (d,) array or None
