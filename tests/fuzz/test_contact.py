@@ -1,4 +1,4 @@
-"""Fuzz suite for contact: its references against closed forms, and its judges on correct and wrong runs."""
+"""Fuzz suite for contact: its references against closed forms, and its checks on correct and wrong runs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from scripts.experiments.fuzz.contact import comparisons, judges
+from scripts.experiments.fuzz.contact import checks, comparisons
 from scripts.experiments.fuzz.contact.cases import Case
-from scripts.experiments.fuzz.contact.law import answer_impact
-from scripts.experiments.fuzz.contact.record import Record, draw, judge_seed
+from scripts.experiments.fuzz.contact.law import apply_impact_law
+from scripts.experiments.fuzz.contact.record import Record, check_seed, draw
 from scripts.experiments.fuzz.contact.slides import Slides
 from scripts.experiments.fuzz.contact.stops import Contact
-from scripts.experiments.fuzz.contact.table import table
+from scripts.experiments.fuzz.contact.table import format_table
 from scripts.experiments.fuzz.contact.time_stepping import TimeStepping
-from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.main import main
-from scripts.experiments.fuzz.read import read
+from scripts.experiments.fuzz.read import read_model
+from scripts.experiments.fuzz.reference import ReferenceIntegrator
 from scripts.experiments.fuzz.spatial import Array
 from tests.conftest import assert_close
 
@@ -44,14 +44,14 @@ def stack(masses: list[float], gravity: float = 0.0) -> dict[str, str]:
 def impact_velocities(masses: list[float], rates: list[float], e: list[float]) -> tuple[Array, float]:
     """Return world velocities after the impact of a stack without gaps, and the energy lost."""
     bodies = np.tril(np.ones((len(masses), len(masses))))
-    impact = answer_impact(bodies.T @ np.diag(masses) @ bodies, np.eye(len(masses)), np.array(rates), np.array(e))
+    impact = apply_impact_law(bodies.T @ np.diag(masses) @ bodies, np.eye(len(masses)), np.array(rates), np.array(e))
     return bodies @ impact.v, impact.lost
 
 
 def test_impact_law_propagates_through_a_cradle() -> None:
     """Equal masses in contact: the last one leaves at the speed of the first."""
     after, lost = impact_velocities([1.0] * 4, [0.0, 0.0, 0.0, -1.0], [1.0] * 4)
-    # the last body hits the stack, the first one bounces off the ground, and the last one leaves again
+    # the last body hits the stack, the first one bounces off the ground, and the last one leaves the stack
     assert_close(after, [0.0, 0.0, 0.0, 1.0], 1e-14)
     assert lost == 0.0
 
@@ -64,7 +64,7 @@ def test_impact_law_leaves_no_stop_approaching_and_balances_energy(seed: int) ->
     D, N, v = root @ root.T + 1e-3 * np.eye(n), random.normal(size=(m, n)), random.normal(size=n)
     e = random.choice([0.0, 0.5, 1.0, 0.9], m)
     for rechoose in (False, True):
-        impact = answer_impact(D, N, v, e, rechoose=rechoose)
+        impact = apply_impact_law(D, N, v, e, rechoose=rechoose)
         size = np.sqrt(v @ D @ v)
         assert np.all(
             N @ impact.v >= -1e-9 * size * np.linalg.norm(np.linalg.solve(np.linalg.cholesky(D), N.T), axis=0)
@@ -78,7 +78,7 @@ def test_a_single_impact_obeys_newtons_law() -> None:
     root = random.normal(size=(3, 3))
     D, n, v = root @ root.T, random.normal(size=(1, 3)), random.normal(size=3)
     v = v if (n @ v)[0] < 0 else -v
-    impact = answer_impact(D, n, v, np.array([0.3]))
+    impact = apply_impact_law(D, n, v, np.array([0.3]))
     assert_close(n @ impact.v, -0.3 * n @ v, 1e-12)
     assert_close(impact.lost, 0.5 * (1 - 0.09) * (n @ v) ** 2 / (n @ np.linalg.solve(D, n.T)), 1e-12)
 
@@ -86,14 +86,14 @@ def test_a_single_impact_obeys_newtons_law() -> None:
 @pytest.mark.parametrize(("k", "count"), [(0, 3), (1, 31), (2, 314)])
 def test_reference_of_slides_counts_collisions_that_give_pi(k: int, count: int) -> None:
     """A unit mass between a wall and a mass of 100^k has floor(pi 10^k) impacts."""
-    model = read(stack([1.0, 100.0**k]))
+    model = read_model(stack([1.0, 100.0**k]))
     elastic = Contact(lower=0.0, restitution=1.0)
     history = Slides(model, {"x0": elastic, "x1": elastic}).run(np.array([1.0, 1.0]), np.array([0.0, -1.0]), 20.0)
     assert len(history.impacts) == count
 
 
 def test_reference_of_slides_agrees_with_closed_forms() -> None:
-    model = read(stack([2.0], G))
+    model = read_model(stack([2.0], G))
     history = Slides(model, {"x0": Contact(lower=0.0, restitution=0.5)}).run(np.array([1.0]), np.zeros(1), 2.0)
     flight = np.sqrt(2 / G)
     ends = flight + np.cumsum(np.r_[0.0, flight * 2 * 0.5 ** np.arange(1, 30)])
@@ -101,14 +101,14 @@ def test_reference_of_slides_agrees_with_closed_forms() -> None:
     assert len(times) > 10
     assert_close(times, ends[: len(times)], 1e-12)
     rubbing = Slides(model, {"x0": Contact(friction=30.0)}).run(np.zeros(1), np.array([3.0]), 2.0)
-    stops_after = 3.0 / (G + 15.0)  # 30 N on 2 kg, which then sticks
+    stops_after = 3.0 / (G + 15.0)  # 30 N of friction on 2 kg; then the joint sticks
     q, v = rubbing.at(np.array([stops_after + 0.1]))
     assert_close(q[0, 0], 1.5 * stops_after, 1e-12)
     assert_close(v[0, 0], 0.0, 0.0)
 
 
 def test_time_stepping_converges_to_the_reference_of_slides() -> None:
-    model = read(stack([1.0, 3.0], G))
+    model = read_model(stack([1.0, 3.0], G))
     contacts = {"x0": Contact(0.7, 0.0, np.inf, 0.6), "x1": Contact(2.0, 0.0, np.inf, 0.3)}
     q, v, end = np.array([0.05, 0.1]), np.array([-0.4, 0.2]), 0.15
     history = Slides(model, contacts).run(q, v, end)
@@ -121,12 +121,12 @@ def test_time_stepping_converges_to_the_reference_of_slides() -> None:
 
 
 def test_time_stepping_converges_on_closed_chains_without_contact() -> None:
-    """Without contact it integrates the same equations as the suite's judge."""
-    model = read(dict(ckc_pin.load("five_bar").sources.texts))
+    """Without contact the scheme integrates the same equations as the reference integrator."""
+    model = read_model(dict(ckc_pin.load("five_bar").sources.texts))
     at = ckc_pin.load("five_bar").assembled
     order = [ckc_pin.load("five_bar").coordinates.index(label) for label in model.labels]
     q, v = at.q_tree[order], (at.rho @ np.array([1.0, -2.0]))[order]
-    end = Judge(model).pieces(q[None], v[None], np.array([0.2]), 1e-9)
+    end = ReferenceIntegrator(model).integrate_segments(q[None], v[None], np.array([0.2]), 1e-9)
     assert end.resolved.all()
     errors = [np.abs(TimeStepping(model, {}).run(q, v, 0.2, n, 1)[-1] - end.q[0]).max() for n in (50, 200)]
     assert errors[0] < 1e-2
@@ -144,23 +144,23 @@ def bouncing(tmp_path: Path) -> tuple[Case, ckc_pin.Run]:
     return case, ckc_pin.simulate(case.write(tmp_path / "case"), overrides)
 
 
-def test_judges_accept_a_correct_run_and_reject_wrong_ones(tmp_path: Path) -> None:
+def test_checks_accept_a_correct_run_and_reject_wrong_ones(tmp_path: Path) -> None:
     case, run = bouncing(tmp_path)
-    model = read(case.texts)
+    model = read_model(case.texts)
     assert len(run.events) >= 2
-    assert judges.energy_fault(run, model, case) == ("", "")
-    assert judges.limits_fault(run, case) == ""
-    assert comparisons.compare_with_slides(run, model, case) == ("", "")
+    assert checks.check_energy(run, model, case) == ("", "")
+    assert checks.check_limits(run, case) == ""
+    assert comparisons.compare_with_event_driven(run, model, case) == ("", "")
     bouncier = {**case.contacts, "x0": Contact(0.0, 0.0, np.inf, 0.6)}
     other = replace(case, contacts={**case.contacts, "x1": Contact(0.0, 0.0, np.inf, 0.81)})
-    assert comparisons.compare_with_slides(run, model, other)[0] == "reference"
-    assert comparisons.compare_with_steps(run, model, case) == ("", "")
-    assert comparisons.compare_with_steps(run, model, replace(case, contacts=bouncier))[0] == "stepping"
+    assert comparisons.compare_with_event_driven(run, model, other)[0] == "reference"
+    assert comparisons.compare_with_time_stepping(run, model, case) == ("", "")
+    assert comparisons.compare_with_time_stepping(run, model, replace(case, contacts=bouncier))[0] == "stepping"
     faster = replace(run, v_tree=run.v_tree * np.linspace(1, 1.001, len(run.t))[:, None])
-    assert judges.energy_fault(faster, model, case)[0] in ("grown", "energy")
+    assert checks.check_energy(faster, model, case)[0] in ("grown", "energy")
     assert run.dissipated is not None
-    assert judges.energy_fault(replace(run, dissipated=-run.dissipated), model, case)[0] == "dissipated"
-    assert judges.limits_fault(replace(run, q_tree=run.q_tree - 1e-6), case).startswith("x0 is 1e-06 beyond")
+    assert checks.check_energy(replace(run, dissipated=-run.dissipated), model, case)[0] == "dissipated"
+    assert checks.check_limits(replace(run, q_tree=run.q_tree - 1e-6), case).startswith("x0 is 1e-06 beyond")
     assert comparisons.compare(run, run, model, 1e-8).fault == ""
     assert comparisons.compare(run, faster, model, 1e-8).fault.startswith("states")
     later = [{**event, "t": event["t"] + 1e-6} for event in run.events]
@@ -170,8 +170,8 @@ def test_judges_accept_a_correct_run_and_reject_wrong_ones(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("kind", ["pendulums", "closed"])
 def test_runs_of_random_chains_are_correct(kind: str) -> None:
-    record = judge_seed(1, kind)
-    assert record.findings == [], record
+    record = check_seed(1, kind)
+    assert record.faults == [], record
     assert record.runs >= 3
 
 
@@ -183,7 +183,7 @@ def test_a_seed_always_draws_the_same_case() -> None:
 def test_table_names_the_seeds_of_wrong_runs() -> None:
     record = Record(17, "stack", runs=3, compared=True)
     record.add("grown", "dae", "energy grows by 0.1 of the largest")
-    text = table([record, Record(18, "stack", runs=3, compared=True)])
+    text = format_table([record, Record(18, "stack", runs=3, compared=True)])
     assert "1 seeds: 17" in text
     assert "seed 17 stack (dae): energy grows by 0.1" in text
 

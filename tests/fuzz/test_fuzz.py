@@ -1,4 +1,4 @@
-"""A part of the fuzz suite: random motions of shipped and random mechanisms, without errors or wrong results."""
+"""Some seeds of the fuzz suite: random motions of shipped and random mechanisms are correct."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from hypothesis import strategies as st
 
 import ckc_pin
 from ckc_pin.kinematics.sigma import sigma
-from scripts.experiments.fuzz.joint_forces import JointForces, Unlike, joint_forces
-from scripts.experiments.fuzz.judge import Judge
-from scripts.experiments.fuzz.main import drawn, one
+from scripts.experiments.fuzz.joint_forces import ControlMismatch, JointForces, read_joint_forces
+from scripts.experiments.fuzz.main import check_seed, open_motion
 from scripts.experiments.fuzz.motions import Motion
-from scripts.experiments.fuzz.read import read
+from scripts.experiments.fuzz.read import read_model
 from scripts.experiments.fuzz.record import run_motion
+from scripts.experiments.fuzz.reference import ReferenceIntegrator
 
 ANGLE, RATE = st.floats(-3.14, 3.14), st.floats(-20, 20)
 
 
-REGRESSION_SEEDS_SHIPPED = [100193]  # had an output row on another branch
-REGRESSION_SEEDS_RANDOM = [301017]  # Radau accepted wrong steps with a Jacobian that was noise
+REGRESSION_SEEDS_SHIPPED = [100193]  # an output row was on another branch
+REGRESSION_SEEDS_RANDOM = [301017]  # Radau accepted wrong steps with a Jacobian dominated by noise
 
 
 @pytest.mark.parametrize("seed", [*range(8), *REGRESSION_SEEDS_SHIPPED])
 def test_random_motions_of_shipped_mechanisms_are_correct(seed: int) -> None:
-    record = one(seed, "shipped")
+    record = check_seed(seed, "shipped")
     assert record.verdict in ("done", "stopped", "refused"), record
-    assert not record.off, record
+    assert not record.failed_before_stop, record
 
 
 @pytest.mark.parametrize("seed", [*range(8), *REGRESSION_SEEDS_RANDOM])
 def test_random_motions_of_random_mechanisms_are_correct(seed: int) -> None:
-    record = one(seed, "random")
+    record = check_seed(seed, "random")
     assert record.verdict in ("done", "stopped", "refused"), record
-    assert not record.off, record
+    assert not record.failed_before_stop, record
 
 
 @settings(max_examples=10, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
@@ -65,8 +65,8 @@ SAMPLED = {**SET_POINT, "sample_time": 0.004, "delay": 0.0068}
 
 @pytest.mark.parametrize("controller", [SET_POINT, SAMPLED, {**SET_POINT, "torque_limit": 0.5}])
 @pytest.mark.parametrize("formulation", ["reduced", "dae"])
-def test_controlled_motions_are_judged_with_their_control_law(controller: dict[str, Any], formulation: str) -> None:
-    """The judge implements the control law independently: other gains, limits or delays do not fit the run."""
+def test_controlled_motions_are_checked_with_their_control_law(controller: dict[str, Any], formulation: str) -> None:
+    """The suite implements the control law independently: other gains, limits or delays contradict the run."""
     overrides = {
         "formulation": formulation,
         "t_end": 0.3,
@@ -77,31 +77,32 @@ def test_controlled_motions_are_judged_with_their_control_law(controller: dict[s
     }
     record, run = run_motion(Motion(0, "five_bar", "five_bar/swing", overrides))
     assert run is not None
-    assert (record.verdict, record.why, record.unresolved) == ("done", "", 0)
-    assert record.pieces >= 3
+    assert (record.verdict, record.fault, record.unresolved) == ("done", "", 0)
+    assert record.segments >= 3
     assert record.worst < 100
-    model = read(run.texts)
+    model = read_model(run.texts)
     for other in ({"K_P": 5.01}, {"K_V": 1.01}, {"torque_limit": 0.4}, {"sample_time": 0.004, "delay": 0.006}):
-        with pytest.raises(Unlike):
-            joint_forces({**controller, **other}, model, run, 0.0004)
+        with pytest.raises(ControlMismatch):
+            read_joint_forces({**controller, **other}, model, run, 0.0004)
 
 
-def test_judge_accounts_for_joint_forces() -> None:
-    """The judge's motion changes with a force at a joint."""
-    judge = Judge(read(dict(ckc_pin.load("five_bar").sources.texts)))
+def test_reference_integrator_applies_joint_forces() -> None:
+    reference = ReferenceIntegrator(read_model(dict(ckc_pin.load("five_bar").sources.texts)))
     at = ckc_pin.load("five_bar").assembled
-    order = [ckc_pin.load("five_bar").coordinates.index(label) for label in judge.model.labels]
-    columns = np.array([judge.model.labels.index(name) for name in ("theta_1", "theta_3")])
+    order = [ckc_pin.load("five_bar").coordinates.index(label) for label in reference.model.labels]
+    columns = np.array([reference.model.labels.index(name) for name in ("theta_1", "theta_3")])
     q, dt = at.q_tree[order][None], np.array([1e-3])
-    free, pushed = (judge.pieces(q, 0 * q, dt, 1e-9, JointForces(columns, np.array([[u, 0.0]]))) for u in (0.0, 1.0))
+    free, pushed = (
+        reference.integrate_segments(q, 0 * q, dt, 1e-9, JointForces(columns, np.array([[u, 0.0]]))) for u in (0.0, 1.0)
+    )
     D = ckc_pin.Terms(ckc_pin.load("five_bar"), at, np.zeros(4)).D
     gained = (pushed.v - free.v)[0][columns] / dt
     assert np.abs(gained - np.linalg.solve(D, [1.0, 0.0])).max() < 1e-3 * np.abs(gained).max()
 
 
 def test_suite_rejects_an_inaccurate_run() -> None:
-    """A run with tolerance 1e-3 does not pass as one with 1e-9."""
-    with drawn(10, "shipped", "five_bar") as motion:
+    """A run with tolerance 1e-3 fails the check of a run with 1e-9."""
+    with open_motion(10, "shipped", "five_bar") as motion:
         coarse = replace(
             motion, overrides={**motion.overrides, "formulation": "dae", "solver.rtol": 1e-3, "t_end": 1.0}
         )

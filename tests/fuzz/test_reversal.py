@@ -1,4 +1,4 @@
-"""The verdict on reversed motions: a correct run passes, a tampered one does not."""
+"""Fuzz suite: the check by time reversal accepts a correct run and rejects a wrong one."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
-from scripts.experiments.fuzz.read import read
-from scripts.experiments.fuzz.record import ALLOWED, DOUBTFUL, run_motion
-from scripts.experiments.fuzz.reversal import INSTANTS, reversal
+from scripts.experiments.fuzz.read import read_model
+from scripts.experiments.fuzz.record import ALLOWED_FACTOR, SUSPECT_FACTOR, run_motion
+from scripts.experiments.fuzz.reference import ReferenceIntegrator
+from scripts.experiments.fuzz.reversal import INSTANTS, measure_reversal_error
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "spf", "dae"])
@@ -27,10 +27,10 @@ def test_a_reversed_motion_retraces_its_path(formulation: str) -> None:
     motion = Motion(0, "five_bar", "five_bar/swing", overrides)
     record, run = run_motion(motion, thorough=True)
     assert run is not None
-    assert (record.verdict, record.why) == ("done", "")
+    assert (record.verdict, record.fault) == ("done", "")
     assert record.reversal < 30
-    judge = Judge(read(run.texts))
-    order = [run.coordinates.index(label) for label in judge.model.labels]
+    reference = ReferenceIntegrator(read_model(run.texts))
+    order = [run.coordinates.index(label) for label in reference.model.labels]
     faster = np.where(np.arange(len(run.t)) == len(run.t) - 1 - INSTANTS, 1.01, 1.0)
     other = replace(run, v_tree=run.v_tree * faster[:, None])
-    assert reversal(other, motion, judge, order, DOUBTFUL) > ALLOWED
+    assert measure_reversal_error(other, motion, reference, order, SUSPECT_FACTOR) > ALLOWED_FACTOR

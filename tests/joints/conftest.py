@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ckc_pin.mechanism.library import library
-from scripts.experiments.fuzz.contact.stops import with_limits
+from scripts.experiments.fuzz.contact.stops import set_limits
 
 FORMULATIONS = ("dae", "reduced", "spf")
 
@@ -52,7 +52,7 @@ def with_joints(tmp_path: Path) -> Callable[..., Path]:
             text = path.read_text() if path.is_file() else ""
             for joint, (lower, upper) in (limits or {}).items():
                 if path.suffix == ".urdf":
-                    text = with_limits(text, joint, lower, upper)
+                    text = set_limits(text, joint, lower, upper)
             if path.name == "mechanism.toml":
                 text += "".join(
                     f'\n[[joint]]\nname = "{joint}"\n'

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ckc_pin import Terms, load, simulate
-from scripts.experiments.fuzz.contact.stops import with_limits
+from scripts.experiments.fuzz.contact.stops import set_limits
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.conftest import assert_close
 
@@ -36,7 +36,7 @@ def write_with_friction_and_stops(seed: int, folder: Path) -> tuple[Path, dict[s
             below, above = random.uniform(0.02, 0.4, 2) * reach[k]
             for path in folder.glob("*.urdf"):
                 path.write_text(
-                    with_limits(path.read_text(), name, float(numbers[k] - below), float(numbers[k] + above))
+                    set_limits(path.read_text(), name, float(numbers[k] - below), float(numbers[k] + above))
                 )
             text += f"stops = true\nrestitution = {float(random.choice([0.0, 0.5, 0.8]))!r}\n"
     (folder / "mechanism.toml").write_text(text)

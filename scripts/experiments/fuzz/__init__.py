@@ -1,1 +1,1 @@
-"""Random motions, judged by an integration that shares nothing with the package."""
+"""Random motions, compared with an integration that is independent of the package."""

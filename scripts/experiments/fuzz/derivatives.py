@@ -1,7 +1,7 @@
-"""Random sensitivities through impacts, stops and friction, judged by one-sided differences from both sides.
+"""Random sensitivities through impacts, stops and friction, compared with one-sided differences on both sides.
 
-A derivative exists where the difference quotients of runs with a larger and with a smaller parameter have one limit.
-Each side is computed with two steps; where these disagree, as they do beside an event, an output instant says nothing.
+A derivative exists if difference quotients with a larger and with a smaller parameter have the same limit. Each side is
+computed with two steps. Output instants at which they disagree, as next to an event, are ignored.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,70 +21,76 @@ from ckc_pin import Terms
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import values_of, with_components
-from scripts.experiments.fuzz.contact.stops import with_limits
+from scripts.experiments.fuzz.contact.stops import set_limits
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from scripts.experiments.fuzz.spatial import Array
 
-__all__ = ["Draw", "JudgedColumn", "columns_of", "columns_table", "draw", "is_wrong", "judge_columns"]
+__all__ = ["ColumnCheck", "Draw", "check_columns", "check_sensitivities", "draw", "format_columns", "is_wrong"]
 
-RTOL, RTOL_RUNS = 1e-10, 1e-12  # of the sensitivities, and of the runs that differences are taken of
+RTOL, RTOL_RUNS = 1e-10, 1e-12  # of sensitivities, and of the runs for differences
 INSTANTS = 40
-STEP_FACTOR = 4.0  # between the two steps of a side
-LARGEST_STEP, SMALLEST_STEP = 1e-2, 1e-6  # of the parameter's own scale
-WANTED_CHANGE = 1e-5  # of the motion, relative: what a step should bring about
-NOISE = 3e-11  # relative, of a run's states
-AGREEMENT = 1e-3  # of the largest entry: derivatives that differ by less are equal
-CONVERGED = 3e-2  # of the largest entry: how far the two steps of a side may differ
-PARAMETERS = 4  # for each mechanism
-ENDS = {"friction": (0.0,), "damping": (0.0,), "restitution": (0.0, 1.0), "armature": (0.0,)}  # one side is refused
+STEP_FACTOR = 4.0  # ratio of the two difference steps of a side
+LARGEST_STEP, SMALLEST_STEP = 1e-2, 1e-6  # relative to the parameter's scale
+TARGET_CHANGE = 1e-5  # relative change of the motion by a difference step
+NOISE = 3e-11  # relative error of a run's states
+AGREEMENT = 1e-3  # derivatives are equal if they differ by less, relative to the largest entry
+CONVERGED = 3e-2  # largest difference of the two steps of a side, relative to the largest entry
+PARAMETERS = 4  # per mechanism
+RANGE_ENDS = {
+    "friction": (0.0,),
+    "damping": (0.0,),
+    "restitution": (0.0, 1.0),
+    "armature": (0.0,),
+}  # values without a run on one side
 WRONG = ("false none", "missed", "wrong value")
-RAW = "raised"
-LIMIT = {"solver.max_rhs": 200_000, "solver.max_wall_s": 10.0}
+EXCEPTION = "exception"
+SOLVER_LIMITS = {"solver.max_rhs": 200_000, "solver.max_wall_s": 10.0}
 
 
 @dataclass(frozen=True)
 class Draw:
-    """A scene with friction and stops, and the parameters that its sensitivities are asked for."""
+    """A scene with friction and stops, and the parameters of its sensitivities."""
 
     seed: int
     kind: str
     scene: Path
     overrides: dict[str, Any]
-    parameters: dict[str, float]  # name, and the value that it has
+    parameters: dict[str, float]  # values by name
 
 
 @dataclass(frozen=True)
-class JudgedColumn:
-    """One parameter of one scene.
+class ColumnCheck:
+    """Comparison of the sensitivity of one parameter of one scene with differences.
 
     Attributes
     ----------
-    verdict : str
-        Of the sensitivities: "derivative", "none", or why there is neither.
-    judged : str
-        By differences: "derivative", "none" or "undecided".
+    computed : str
+        Result of `sensitivities`: "derivative", "none", or the reason why there is neither.
+    expected : str
+        Result of the differences: "derivative", "none" or "undecided".
     error : float
-        Largest difference from the differences, of the largest entry; NaN where it is not known.
+        Largest error over the allowed one; NaN if it was not computed.
     note : str
+        Message of the run with sensitivities.
     """
 
     seed: int
     kind: str
     formulation: str
     parameter: str
-    verdict: str
-    judged: str
+    computed: str
+    expected: str
     error: float = np.nan
     note: str = ""
 
     @property
     def result(self) -> str:
-        """What the comparison says: "right", "false none", "missed", "wrong value" or "undecided"."""
-        if self.verdict not in ("derivative", "none") or self.judged == "undecided":
+        """Result of the comparison: "right", "false none", "missed", "wrong value" or "undecided"."""
+        if self.computed not in ("derivative", "none") or self.expected == "undecided":
             return "undecided"
-        if self.verdict == "none":
-            return "right" if self.judged == "none" else "false none"
-        if self.judged == "none":
+        if self.computed == "none":
+            return "right" if self.expected == "none" else "false none"
+        if self.expected == "none":
             return "missed"
         return "wrong value" if self.error > 1.0 else "right"
 
@@ -95,28 +101,28 @@ class JudgedColumn:
 def draw(seed: int, folder: Path) -> Draw:
     """Write a random mechanism with friction and stops to a folder, and draw its start and parameters."""
     random = np.random.default_rng([seed, 41])
-    made = random_mechanism(seed)
-    made.write(folder)
-    plain = ckc_pin.load(folder)
-    tree, reach = plain.tree, plain.tree.step_scale
-    numbers = tree.to_coordinates(plain.q_tree)
-    force = np.abs(Terms(plain, plain.assembled, np.zeros(plain.n)).h_tree)
-    force = np.where(force > 1e-9 * force.max(), force, force.max()) if force.any() else np.ones(plain.n)
+    random_files = random_mechanism(seed)
+    random_files.write(folder)
+    without_contact = ckc_pin.load(folder)
+    tree, reach = without_contact.tree, without_contact.tree.step_scale
+    numbers = tree.to_coordinates(without_contact.q_tree)
+    force = np.abs(Terms(without_contact, without_contact.assembled, np.zeros(without_contact.n)).h_tree)
+    force = np.where(force > 1e-9 * force.max(), force, force.max()) if force.any() else np.ones(without_contact.n)
     text, urdf = (folder / "mechanism.toml").read_text(), (folder / "tree.urdf").read_text()
     for name, k in tree.index.items():
         if name in tree.free_coordinates:
             continue
-        rubs, stops = random.random() < 0.5, random.random() < 0.4
-        if not (rubs or stops):
+        has_friction, has_stops = random.random() < 0.5, random.random() < 0.4
+        if not (has_friction or has_stops):
             continue
         text += f'\n[[joint]]\nname = "{name}"\n'
-        if rubs:
+        if has_friction:
             text += f"friction = {float(force[k] * 10 ** random.uniform(-2, 0.3))!r}\n"
-        if stops:
-            room = random.uniform(0.02, 0.4, 2) * reach[k]
-            if random.random() < 0.25:  # at its stop from the start
-                room[int(random.integers(2))] = 0.0
-            urdf = with_limits(urdf, name, float(numbers[k] - room[0]), float(numbers[k] + room[1]))
+        if has_stops:
+            margins = random.uniform(0.02, 0.4, 2) * reach[k]
+            if random.random() < 0.25:  # at a stop at t = 0
+                margins[int(random.integers(2))] = 0.0
+            urdf = set_limits(urdf, name, float(numbers[k] - margins[0]), float(numbers[k] + margins[1]))
             text += f"stops = true\nrestitution = {float(random.choice([0.0, 0.0, 0.3, 0.5, 0.9, 1.0]))!r}\n"
     (folder / "mechanism.toml").write_text(text)
     (folder / "tree.urdf").write_text(urdf)
@@ -129,7 +135,7 @@ def draw(seed: int, folder: Path) -> Draw:
         "initial": {"q_dot": dict(zip(mechanism.independent, rates, strict=True))},
         "t_end": float(0.6 * pace * 10 ** random.uniform(-1, 0)),
         "formulation": "dae" if mechanism.splits_root else str(random.choice(["dae", "reduced"])),
-        **LIMIT,
+        **SOLVER_LIMITS,
     }
     overrides["solver.output_dt"] = overrides["t_end"] / INSTANTS
     if mechanism.splits_root or random.random() < 0.4:
@@ -138,64 +144,64 @@ def draw(seed: int, folder: Path) -> Draw:
         start = mechanism.independent_part(mechanism.q_tree).tolist()
         overrides["initial"]["q"] = dict(zip(mechanism.independent, start, strict=True))
     parameters = _parameters(random, mechanism, overrides["initial"]) if _scale(mechanism)[1] else {}
-    return Draw(seed, made.kind, folder, overrides, parameters)
+    return Draw(seed, random_files.kind, folder, overrides, parameters)
 
 
 def _parameters(random: np.random.Generator, mechanism: Mechanism, initial: Mapping[str, Any]) -> dict[str, float]:
-    """Draw a key first, so that the few stops and frictions are not lost among inertias."""
-    values = with_components(values_of(mechanism.spec, mechanism.urdf))
-    known = {name: float(x) for name, x in values.items() if not isinstance(x, tuple)}
-    known = {name: x for name, x in known.items() if x not in ENDS.get(name.rpartition(".")[2], ())}
+    """Draw parameters. The key is drawn first, so that stops and friction are as frequent as inertias."""
+    components = with_components(values_of(mechanism.spec, mechanism.urdf))
+    values = {name: float(x) for name, x in components.items() if not isinstance(x, tuple)}
+    values = {name: x for name, x in values.items() if x not in RANGE_ENDS.get(name.rpartition(".")[2], ())}
     for key in ("q", "q_dot"):
-        known |= {f"initial.{key}.{name}": x for name, x in initial.get(key, {}).items()}
-    if "at" in initial:  # what moves an assembled start is refused
-        placing = re.compile(r"joint\..*\.(xyz|rpy)\..|loop\..*|coupling\..*")
-        known = {name: x for name, x in known.items() if not placing.fullmatch(name)}
+        values |= {f"initial.{key}.{name}": x for name, x in initial.get(key, {}).items()}
+    if "at" in initial:  # parameters that change an assembled start are unsupported
+        geometry = re.compile(r"joint\..*\.(xyz|rpy)\..|loop\..*|coupling\..*")
+        values = {name: x for name, x in values.items() if not geometry.fullmatch(name)}
     groups: dict[str, list[str]] = {}
-    for name in known:
+    for name in values:
         root, second, *_ = parts = name.split(".")
         key = {"initial": second, "gravity": ""}.get(root, parts[-1] if len(parts[-1]) > 1 else parts[-2])
         groups.setdefault(f"{root}.{key}", []).append(name)
     drawn: dict[str, float] = {}
-    while len(drawn) < min(PARAMETERS, len(known)):
+    while len(drawn) < min(PARAMETERS, len(values)):
         of_key = groups[str(random.choice(list(groups)))]
         name = of_key[int(random.integers(len(of_key)))]
-        drawn[name] = known[name]
+        drawn[name] = values[name]
     return drawn
 
 
 # --- the suite ---------------------------------------------------------------------------------------
 
 
-def columns_of(seed: int) -> list[JudgedColumn]:
-    """Draw a seed's scene and judge its columns; an exception that is none of the package's is a wrong column too."""
+def check_sensitivities(seed: int) -> list[ColumnCheck]:
+    """Draw a seed's scene and check its sensitivities. An unexpected exception counts as a wrong column."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            return judge_columns(draw(seed, Path(folder) / "mechanism"))
+            return check_columns(draw(seed, Path(folder) / "mechanism"))
         except CkcError as error:
-            return [JudgedColumn(seed, "", "", "", f"refused: {error}", "undecided")]
+            return [ColumnCheck(seed, "", "", "", f"refused: {error}", "undecided")]
         except Exception as error:
-            return [JudgedColumn(seed, "", "", "", RAW, "undecided", note=f"{type(error).__name__}: {error}")]
+            return [ColumnCheck(seed, "", "", "", EXCEPTION, "undecided", note=f"{type(error).__name__}: {error}")]
 
 
-def is_wrong(column: JudgedColumn) -> bool:
-    """Whether sensitivities and differences contradict each other."""
-    return column.verdict == RAW or column.result in WRONG
+def is_wrong(column: ColumnCheck) -> bool:
+    """Return whether sensitivities and differences contradict each other."""
+    return column.computed == EXCEPTION or column.result in WRONG
 
 
-def columns_table(columns: Sequence[JudgedColumn]) -> str:
-    """Counts by kind of mechanism, the reasons of what is undecided, and every wrong column."""
+def format_columns(columns: Sequence[ColumnCheck]) -> str:
+    """Return a table of counts by kind of mechanism, the reasons of undecided columns, and all wrong columns."""
     head = ("right", *WRONG, "undecided")
     lines = [f"{'mechanism':18s} {'columns':>8s}" + "".join(f" {name:>12s}" for name in head) + f" {'none':>6s}"]
     kinds = sorted({column.kind for column in columns})
     for kind in (*kinds, "all"):
         of_kind = [column for column in columns if kind in (column.kind, "all")]
         count = Counter(column.result for column in of_kind)
-        none = sum(column.judged == "none" for column in of_kind)
+        none = sum(column.expected == "none" for column in of_kind)
         numbers = "".join(f" {count[name]:12d}" for name in head)
         lines.append(f"{kind:18s} {len(of_kind):8d}{numbers} {none:6d}")
     why = Counter(
-        "differences do not converge, or on one side alone" if x.verdict in ("derivative", "none") else x.verdict[:40]
+        "differences do not converge, or on one side alone" if x.computed in ("derivative", "none") else x.computed[:40]
         for x in columns if x.result == "undecided"
     )  # fmt: skip
     lines += ["", "undecided:", *(f"  {count:5d}  {reason}" for reason, count in why.most_common())]
@@ -205,11 +211,11 @@ def columns_table(columns: Sequence[JudgedColumn]) -> str:
     return "\n".join(lines)
 
 
-# --- judging -----------------------------------------------------------------------------------------
+# --- comparison -----------------------------------------------------------------------------------------
 
 
-def judge_columns(drawn: Draw) -> list[JudgedColumn]:
-    """Ask for each parameter by itself and for all together, and compare with differences."""
+def check_columns(drawn: Draw) -> list[ColumnCheck]:
+    """Compute sensitivities for each parameter alone and for all of them, and compare with differences."""
     if not drawn.parameters:
         return []
     overrides = {**drawn.overrides, "solver.rtol": RTOL_RUNS}
@@ -219,35 +225,35 @@ def judge_columns(drawn: Draw) -> list[JudgedColumn]:
         return [_column(drawn, name, f"no run: {error}") for name in drawn.parameters]
     if run.status != "done":
         return [_column(drawn, name, f"no run: {run.message}") for name in drawn.parameters]
-    columns = [_judge(drawn, name, run) for name in drawn.parameters]
-    return [*columns, *_together(drawn, columns)]
+    columns = [_check_column(drawn, name, run) for name in drawn.parameters]
+    return [*columns, *_check_all_parameters(drawn, columns)]
 
 
-def _column(drawn: Draw, name: str, verdict: str, judged: str = "undecided", **more: Any) -> JudgedColumn:
-    return JudgedColumn(drawn.seed, drawn.kind, drawn.overrides["formulation"], name, verdict, judged, **more)
+def _column(drawn: Draw, name: str, computed: str, expected: str = "undecided", **more: Any) -> ColumnCheck:
+    return ColumnCheck(drawn.seed, drawn.kind, drawn.overrides["formulation"], name, computed, expected, **more)
 
 
-def _together(drawn: Draw, columns: Sequence[JudgedColumn]) -> list[JudgedColumn]:
-    """Whether the verdict about all parameters is that about the first of them that has none."""
-    alone = [column.verdict for column in columns]
-    if any(verdict not in ("derivative", "none") for verdict in alone):
+def _check_all_parameters(drawn: Draw, columns: Sequence[ColumnCheck]) -> list[ColumnCheck]:
+    """Check that sensitivities for all parameters exist if and only if they exist for each parameter alone."""
+    separate = [column.computed for column in columns]
+    if any(computed not in ("derivative", "none") for computed in separate):
         return []
     try:
-        found = ckc_pin.sensitivities(drawn.scene, list(drawn.parameters), {**drawn.overrides, "solver.rtol": RTOL})
+        result = ckc_pin.sensitivities(drawn.scene, list(drawn.parameters), {**drawn.overrides, "solver.rtol": RTOL})
     except CkcError as error:
         return [_column(drawn, "all", f"refused: {error}")]
-    verdict, expected = _verdict(found), "none" if "none" in alone else "derivative"
-    return [_column(drawn, "all", verdict, expected, error=0.0, note=found.run.message)]
+    computed, expected = _verdict(result), "none" if "none" in separate else "derivative"
+    return [_column(drawn, "all", computed, expected, error=0.0, note=result.run.message)]
 
 
-def _verdict(found: ckc_pin.Sensitivities) -> str:
-    if found.run.status == "done":
+def _verdict(result: ckc_pin.Sensitivities) -> str:
+    if result.run.status == "done":
         return "derivative"
-    return "none" if "no derivative" in found.run.message else f"stopped: {found.run.message}"
+    return "none" if "no derivative" in result.run.message else f"stopped: {result.run.message}"
 
 
 def _states(run: ckc_pin.Run, mechanism: Mechanism) -> Array:
-    """Joints' coordinates and rates by instant, (m, 2 n), in units of a mechanism that stays the same."""
+    """Return coordinates and rates of the joints by instant, (m, 2 n), scaled by `mechanism`, the unperturbed one."""
     scale, joints = _scale(mechanism)
     return np.hstack([run.q_tree[:, joints], run.v_tree[:, joints]]) / scale
 
@@ -259,73 +265,71 @@ def _scale(mechanism: Mechanism) -> tuple[Array, Sequence[int]]:
     return np.concatenate([reach, reach / np.sqrt(mechanism.size)]), joints
 
 
-def _judge(drawn: Draw, name: str, run: ckc_pin.Run) -> JudgedColumn:
+def _check_column(drawn: Draw, name: str, run: ckc_pin.Run) -> ColumnCheck:
     try:
-        found = ckc_pin.sensitivities(drawn.scene, [name], {**drawn.overrides, "solver.rtol": RTOL})
+        result = ckc_pin.sensitivities(drawn.scene, [name], {**drawn.overrides, "solver.rtol": RTOL})
     except CkcError as error:
         return _column(drawn, name, f"refused: {error}")
-    verdict, note = _verdict(found), found.run.message
-    if verdict not in ("derivative", "none"):
-        return _column(drawn, name, verdict, note=note)
-    at, here = drawn.parameters[name], run
+    computed, note = _verdict(result), result.run.message
+    if computed not in ("derivative", "none"):
+        return _column(drawn, name, computed, note=note)
+    value, base = drawn.parameters[name], run
     try:
-        sides = _sides(drawn, name, at, here)
-        if verdict == "none" and _differ(*sides) is False:  # what differs may fade before the next instant
-            t = float(found.run.t[-1])
+        sides = _sides(drawn, name, value, base)
+        if computed == "none" and _differ(*sides) is False:  # the difference may decay before the next output instant
+            t = float(result.run.t[-1])
             t_end = t + 1e-3 * (run.t[-1] - t)
-            drawn = Draw(
-                drawn.seed, drawn.kind, drawn.scene, {**drawn.overrides, "t_end": t_end, "solver.output_dt": t_end}, {}
-            )
-            here = ckc_pin.simulate(drawn.scene, {**drawn.overrides, "solver.rtol": RTOL_RUNS})
-            sides = _sides(drawn, name, at, here)
+            drawn = replace(drawn, overrides={**drawn.overrides, "t_end": t_end, "solver.output_dt": t_end})
+            base = ckc_pin.simulate(drawn.scene, {**drawn.overrides, "solver.rtol": RTOL_RUNS})
+            sides = _sides(drawn, name, value, base)
     except _OneSideOnly as error:
-        return _column(drawn, name, verdict, note=f"{note}; {error}")
+        return _column(drawn, name, computed, note=f"{note}; {error}")
     differ = _differ(*sides)
-    judged = "undecided" if differ is None else "none" if differ else "derivative"
+    expected = "undecided" if differ is None else "none" if differ else "derivative"
     largest = np.nan
-    if verdict == judged == "derivative":
+    if computed == expected == "derivative":
         scale, joints = _scale(run.mechanism)
-        S = np.hstack([found.q_tree[:, joints, 0], found.v_tree[:, joints, 0]]) / scale
+        S = np.hstack([result.q_tree[:, joints, 0], result.v_tree[:, joints, 0]]) / scale
         largest = max(side.error(S) for side in sides)
-    return _column(drawn, name, verdict, judged, error=largest, note=note)
+    return _column(drawn, name, computed, expected, error=largest, note=note)
 
 
 class _OneSideOnly(Exception):
-    """With a larger or with a smaller parameter there is no run."""
+    """There is no run with a larger, or with a smaller, parameter."""
 
 
 @dataclass(frozen=True)
 class _Side:
-    """Derivatives by differences on one side: by instant, with how far they may be off; NaN where that is not known."""
+    """One-sided differences by output instant, and their uncertainty; NaN where the two steps disagree."""
 
     value: Array
     uncertainty: Array
 
     def error(self, S: Array) -> float:
-        """The largest difference from what is known, of what is allowed."""
+        """Return the largest error of sensitivities, over the allowed one."""
         size = max(np.nanmax(np.abs(self.value), initial=0.0), np.abs(S).max())
         allowed = 3 * self.uncertainty + AGREEMENT * size
         return float(np.nanmax(np.abs(S - self.value) / allowed[:, None], initial=0.0))
 
 
 def _sides(drawn: Draw, name: str, at: float, run: ckc_pin.Run) -> tuple[_Side, _Side]:
-    here = _states(run, run.mechanism)
+    base = _states(run, run.mechanism)
     unit = abs(at) if name.startswith("link.") and at else max(abs(at), 0.1)
-    moved = _difference(drawn, name, at, 1e-4 * unit, run) * 1e-4 * unit
-    change = float(np.quantile(np.abs(moved).max(axis=1), 0.95))  # some instants are beside an event
-    size = max(1.0, np.abs(here).max())
-    h = 1e-4 * unit * np.clip(WANTED_CHANGE * size / max(change, 1e-300), SMALLEST_STEP / 1e-4, LARGEST_STEP / 1e-4)
+    trial = _difference(drawn, name, at, 1e-4 * unit, run) * 1e-4 * unit
+    change = float(np.quantile(np.abs(trial).max(axis=1), 0.95))  # some instants are next to an event
+    size = max(1.0, np.abs(base).max())
+    h = 1e-4 * unit * np.clip(TARGET_CHANGE * size / max(change, 1e-300), SMALLEST_STEP / 1e-4, LARGEST_STEP / 1e-4)
     return _side(drawn, name, at, h, run), _side(drawn, name, at, -h, run)
 
 
 def _side(drawn: Draw, name: str, at: float, h: float, base: ckc_pin.Run) -> _Side:
-    far, near = (_difference(drawn, name, at, step, base) for step in (h, h / STEP_FACTOR))
-    value = near + (near - far) / (STEP_FACTOR - 1)
-    uncertainty = np.abs(near - far).max(axis=1)
+    coarse, fine = (_difference(drawn, name, at, step, base) for step in (h, h / STEP_FACTOR))
+    value = fine + (fine - coarse) / (STEP_FACTOR - 1)
+    uncertainty = np.abs(fine - coarse).max(axis=1)
     noise = NOISE * max(1.0, np.abs(_states(base, base.mechanism)).max()) * STEP_FACTOR / abs(h)
-    size = np.median(np.abs(near).max(axis=1))
-    lost = uncertainty > CONVERGED * np.maximum(np.abs(near).max(axis=1), size) + 10 * noise
-    value[lost], uncertainty[lost] = np.nan, np.nan
+    size = np.median(np.abs(fine).max(axis=1))
+    unreliable = uncertainty > CONVERGED * np.maximum(np.abs(fine).max(axis=1), size) + 10 * noise
+    value[unreliable], uncertainty[unreliable] = np.nan, np.nan
     return _Side(value, uncertainty + noise)
 
 
@@ -340,12 +344,12 @@ def _difference(drawn: Draw, name: str, at: float, h: float, base: ckc_pin.Run) 
 
 
 def _differ(one: _Side, other: _Side) -> bool | None:
-    """Whether the two sides have derivatives of their own; None where that cannot be told."""
+    """Return whether the derivatives of the two sides differ; None if undecided."""
     size = max(np.nanmax(np.abs(one.value), initial=0.0), np.nanmax(np.abs(other.value), initial=0.0))
-    apart = np.abs(one.value - other.value).max(axis=1)
-    known = np.isfinite(apart)
-    if known.sum() < max(1, len(known) // 4):
+    gap = np.abs(one.value - other.value).max(axis=1)
+    finite = np.isfinite(gap)
+    if finite.sum() < max(1, len(finite) // 4):
         return None
-    allowed = 3 * (one.uncertainty + other.uncertainty)[known] + AGREEMENT * size
-    ratio = float((apart[known] / allowed).max())
+    allowed = 3 * (one.uncertainty + other.uncertainty)[finite] + AGREEMENT * size
+    ratio = float((gap[finite] / allowed).max())
     return None if 1.0 < ratio < 3.0 else ratio >= 3.0

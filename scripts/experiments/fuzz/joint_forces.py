@@ -1,4 +1,7 @@
-"""What a set-point controller does to the joints: eq. 14 read anew, its constant h(q_d) from the rows of the run."""
+"""Joint forces of a set-point controller, by an independent implementation of eq. 14.
+
+The constant h(q_d) is estimated from the rows of the run.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +12,23 @@ from typing import Any
 import numpy as np
 
 from ckc_pin import Run
-from scripts.experiments.fuzz.read import Model, NoJudge
+from scripts.experiments.fuzz.read import Model, UnsupportedMechanism
 from scripts.experiments.fuzz.spatial import Array, IntArray
 
-__all__ = ["PER_SAMPLE", "JointForces", "Unlike", "joint_forces"]
+__all__ = ["PER_SAMPLE", "ControlMismatch", "JointForces", "read_joint_forces"]
 
-PER_SAMPLE = 10  # output instants from one sample to the next; delays are multiples of one
+PER_SAMPLE = 10  # output instants per sample; delays are whole numbers of output instants
 ROUNDING = 1e-9  # relative
-FAR = 1.0  # rad, of a joint between two samples: pieces are shorter then
+MAX_ROTATION_RAD = 1.0  # of a joint between two samples; segments are shorter where it is exceeded
 
 
-class Unlike(Exception):
-    """The u of a run is not what its controller gives."""
+class ControlMismatch(Exception):
+    """The u of a run contradicts its control law."""
 
 
 @dataclass(frozen=True)
 class JointForces:
-    """Forces along joints for P pieces: base - K_P value - K_V rate, within a limit; base is (P, d)."""
+    """Joint forces for P segments: base - K_P value - K_V rate, clipped at a limit; base is (P, d)."""
 
     columns: IntArray
     base: Array
@@ -33,66 +36,68 @@ class JointForces:
     K_V: float = 0.0
     limit: float = np.inf
 
-    def __getitem__(self, pieces: np.ndarray) -> JointForces:
-        """The efforts of some pieces."""
-        return JointForces(self.columns, self.base[pieces], self.K_P, self.K_V, self.limit)
+    def __getitem__(self, segments: np.ndarray) -> JointForces:
+        """Return the joint forces of selected segments."""
+        return JointForces(self.columns, self.base[segments], self.K_P, self.K_V, self.limit)
 
-    def along(self, value: Array, rate: Array) -> Array:
-        """Forces (P, d) at the joints' values and rates."""
+    def evaluate(self, value: Array, rate: Array) -> Array:
+        """Return forces (P, d) at the joints' values and rates."""
         return np.clip(self.base - self.K_P * value - self.K_V * rate, -self.limit, self.limit)
 
 
-def joint_forces(
+def read_joint_forces(
     controller: Mapping[str, Any], model: Model, run: Run, output_dt: float
 ) -> tuple[IntArray, JointForces]:
-    """Rows of a run between which u has no jump, and what acts from each of them to the next.
+    """Return rows of a run between which u does not jump, and the joint forces from each of them to the next.
 
     Raises
     ------
-    NoJudge
-        Limited actuators that are not the independent coordinates.
-    Unlike
-        Rows whose u is not eq. 14's.
+    UnsupportedMechanism
+        A torque limit applies to actuators other than the independent coordinates, or u is at its limit in all rows.
+    ControlMismatch
+        The u of a row differs from eq. 14.
     """
     columns = np.array([model.labels.index(name) for name in run.independent], np.intp)
     at = [run.coordinates.index(name) for name in run.independent]
     target = np.array([controller["q_d"][name] for name in run.independent])
     K_P, K_V, limit = controller["K_P"], controller["K_V"], controller.get("torque_limit", np.inf)
     if np.isfinite(limit) and run.actuated != run.independent:
-        raise NoJudge("limited actuators that are not the independent coordinates")
+        raise UnsupportedMechanism("a torque limit on actuators other than the independent coordinates")
     feedback = K_P * (target - run.q_tree[:, at]) - K_V * run.v_tree[:, at]
     rows = np.arange(len(run.t))
     if "sample_time" not in controller:
-        h = _constant(run.u, feedback, limit)
-        _compare(run.u, feedback, h, limit)
+        h = _estimate_constant(run.u, feedback, limit)
+        _check_control_law(run.u, feedback, h, limit)
         if np.isnan(h).any():
-            raise NoJudge("a limit that cuts at every instant")
+            raise UnsupportedMechanism("u is at its torque limit in all rows")
         return rows, JointForces(columns, np.tile(h + K_P * target, (len(rows), 1)), K_P, K_V, limit)
-    late = round(controller.get("delay", 0.0) / output_dt)
-    changes = (rows >= late) & ((rows - late) % PER_SAMPLE == 0)  # at such a row u may be the old or the new one
-    if run.u[: min(late, len(rows))].any():
-        raise Unlike("u acts before its delay is over")
-    steady = rows[~changes & (rows > late)]
-    seen = feedback[(steady - late) // PER_SAMPLE * PER_SAMPLE]
-    _compare(run.u[steady], seen, _constant(run.u[steady], seen, limit), limit)
-    far = np.abs(run.v_tree).max(axis=1) * PER_SAMPLE * output_dt > FAR
-    ends = np.union1d(rows[changes | far], [0, rows[-1]])
-    return ends, JointForces(columns, run.u[np.where(changes, np.minimum(rows + 1, rows[-1]), rows)[ends]])
+    delay_rows = round(controller.get("delay", 0.0) / output_dt)
+    may_jump = (rows >= delay_rows) & (
+        (rows - delay_rows) % PER_SAMPLE == 0
+    )  # u of such a row may be from before or after the jump
+    if run.u[: min(delay_rows, len(rows))].any():
+        raise ControlMismatch("u is not zero before the delay has elapsed")
+    steady = rows[~may_jump & (rows > delay_rows)]
+    sampled = feedback[(steady - delay_rows) // PER_SAMPLE * PER_SAMPLE]
+    _check_control_law(run.u[steady], sampled, _estimate_constant(run.u[steady], sampled, limit), limit)
+    is_fast = np.abs(run.v_tree).max(axis=1) * PER_SAMPLE * output_dt > MAX_ROTATION_RAD
+    ends = np.union1d(rows[may_jump | is_fast], [0, rows[-1]])
+    return ends, JointForces(columns, run.u[np.where(may_jump, np.minimum(rows + 1, rows[-1]), rows)[ends]])
 
 
-def _constant(u: Array, feedback: Array, limit: float) -> Array:
-    """h(q_d) from rows that the limit does not cut, NaN where there are none."""
+def _estimate_constant(u: Array, feedback: Array, limit: float) -> Array:
+    """Return h(q_d) estimated from rows below the torque limit; NaN for coordinates without such rows."""
     free = np.where(np.abs(u) < limit, u - feedback, np.nan)
-    some = ~np.isnan(free).all(axis=0) if len(u) else np.zeros(u.shape[1], bool)
+    has_free_rows = ~np.isnan(free).all(axis=0) if len(u) else np.zeros(u.shape[1], bool)
     h = np.full(u.shape[1], np.nan)
-    h[some] = np.nanmedian(free[:, some], axis=0)
+    h[has_free_rows] = np.nanmedian(free[:, has_free_rows], axis=0)
     return h
 
 
-def _compare(u: Array, feedback: Array, h: Array, limit: float) -> None:
+def _check_control_law(u: Array, feedback: Array, h: Array, limit: float) -> None:
     if np.abs(u).max(initial=0.0) > limit:
-        raise Unlike(f"u is beyond its limit: {np.abs(u).max():.17g}")
-    known = ~np.isnan(h)
-    off = np.abs(u - np.clip(feedback + h, -limit, limit))[:, known].max(initial=0.0)
-    if off > ROUNDING * max(np.abs(feedback).max(initial=0.0), np.abs(u).max(initial=0.0)):
-        raise Unlike(f"u is off eq. 14 by {off:.2g}")
+        raise ControlMismatch(f"u exceeds its limit: {np.abs(u).max():.17g}")
+    finite = ~np.isnan(h)
+    error = np.abs(u - np.clip(feedback + h, -limit, limit))[:, finite].max(initial=0.0)
+    if error > ROUNDING * max(np.abs(feedback).max(initial=0.0), np.abs(u).max(initial=0.0)):
+        raise ControlMismatch(f"u is off eq. 14 by {error:.2g}")

@@ -1,4 +1,4 @@
-"""Random motions: start, speed, tolerance, formulation, events and control of a mechanism, as a scene's overrides."""
+"""Random motions of a mechanism: start, speed, tolerance, formulation, events and control as scene overrides."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ __all__ = ["SHIPPED", "Motion", "random_motion", "shipped_motion"]
 
 
 @dataclass(frozen=True)
-class _Shipped:
+class _Ranges:
     scene: str
     speed: float = 20.0  # rad/s
-    spread: float = np.pi  # how far starts are from the assembled configuration, rad
+    spread: float = np.pi  # largest distance of a start from the assembled configuration, rad
     t_end: float = 4.0
     output_dt: float = 0.004
     weight: float = 1.0
 
 
 SHIPPED = {
-    "five_bar": _Shipped("five_bar/swing", weight=6),
-    "five_bar_as_printed": _Shipped("five_bar_as_printed/swing"),
-    "four_bar": _Shipped("four_bar", weight=2),
-    "slider_crank": _Shipped("slider_crank", weight=2),
-    "slider_crank_spatial": _Shipped("slider_crank_spatial", weight=2),
-    "three_rrr": _Shipped("three_rrr", weight=2),
-    "delta": _Shipped("delta", spread=0.8, t_end=1.0, weight=1),
-    "stewart": _Shipped("stewart", spread=0.3, t_end=0.5, weight=1),
-    "bricard": _Shipped("bricard", t_end=2.0),
-    "andrews": _Shipped("andrews", speed=200.0, spread=1.0, t_end=0.03, output_dt=5e-5),
-    "flyball": _Shipped("flyball", spread=0.1, t_end=0.2, weight=0.3),
-    "n_four_bar": _Shipped("n_four_bar", speed=8.0, t_end=1.0, weight=0.6),
-    "two_ur5": _Shipped("two_ur5", speed=4.0, spread=0.7, t_end=0.5, weight=0.6),
-    "talos": _Shipped("talos", speed=2.0, spread=0.2, t_end=0.2, weight=0.3),
+    "five_bar": _Ranges("five_bar/swing", weight=6),
+    "five_bar_as_printed": _Ranges("five_bar_as_printed/swing"),
+    "four_bar": _Ranges("four_bar", weight=2),
+    "slider_crank": _Ranges("slider_crank", weight=2),
+    "slider_crank_spatial": _Ranges("slider_crank_spatial", weight=2),
+    "three_rrr": _Ranges("three_rrr", weight=2),
+    "delta": _Ranges("delta", spread=0.8, t_end=1.0, weight=1),
+    "stewart": _Ranges("stewart", spread=0.3, t_end=0.5, weight=1),
+    "bricard": _Ranges("bricard", t_end=2.0),
+    "andrews": _Ranges("andrews", speed=200.0, spread=1.0, t_end=0.03, output_dt=5e-5),
+    "flyball": _Ranges("flyball", spread=0.1, t_end=0.2, weight=0.3),
+    "n_four_bar": _Ranges("n_four_bar", speed=8.0, t_end=1.0, weight=0.6),
+    "two_ur5": _Ranges("two_ur5", speed=4.0, spread=0.7, t_end=0.5, weight=0.6),
+    "talos": _Ranges("talos", speed=2.0, spread=0.2, t_end=0.2, weight=0.3),
 }
 BUDGET = {"solver.max_rhs": 400_000, "solver.max_wall_s": 20.0}
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A scene by name or folder, and what is changed in it."""
+    """A scene, by name or folder, and its overrides."""
 
     seed: int
     mechanism: str
@@ -58,7 +58,7 @@ class Motion:
 
 
 def shipped_motion(seed: int, name: str | None = None) -> Motion:
-    """A random motion of a shipped mechanism."""
+    """Return a random motion of a shipped mechanism."""
     random = np.random.default_rng([seed, 2])
     weights = np.array([shipped.weight for shipped in SHIPPED.values()])
     drawn = str(random.choice(list(SHIPPED), p=weights / weights.sum()))
@@ -67,27 +67,27 @@ def shipped_motion(seed: int, name: str | None = None) -> Motion:
 
 
 def random_motion(seed: int, folder: Path) -> Motion:
-    """A random motion of a random mechanism, whose files are written to a folder."""
+    """Return a random motion of a random mechanism, whose files are written to a folder."""
     random = np.random.default_rng([seed, 3])
-    made = random_mechanism(seed)
-    made.write(folder)
-    about = _Shipped("", t_end=2.0, spread=1.0)
-    return Motion(seed, made.kind, str(folder), _overrides(random, ckc_pin.load(folder), about))
+    mechanism_files = random_mechanism(seed)
+    mechanism_files.write(folder)
+    ranges = _Ranges("", t_end=2.0, spread=1.0)
+    return Motion(seed, mechanism_files.kind, str(folder), _overrides(random, ckc_pin.load(folder), ranges))
 
 
-def _overrides(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> dict[str, Any]:
+def _overrides(random: np.random.Generator, mechanism: Mechanism, ranges: _Ranges) -> dict[str, Any]:
     overrides: dict[str, Any] = {
         "formulation": str(random.choice(["reduced", "spf", "dae"])),
-        "t_end": float(about.t_end * 10 ** random.uniform(-1, 0)),
+        "t_end": float(ranges.t_end * 10 ** random.uniform(-1, 0)),
         "solver.rtol": float(10 ** random.uniform(-10, -2)),
-        "solver.output_dt": about.output_dt,
+        "solver.output_dt": ranges.output_dt,
         **BUDGET,
     }
     if mechanism.splits_root:
         overrides["formulation"] = "dae"
     if random.random() < 0.2:
         overrides["solver.method"] = str(random.choice(["DOP853", "RK45", "Radau"]))
-    q, q_dot = _start(random, mechanism, about)
+    q, q_dot = _start(random, mechanism, ranges)
     overrides["initial"] = {"q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))}
     if q is None:
         overrides["initial"]["at"] = "assembled"
@@ -101,31 +101,31 @@ def _overrides(random: np.random.Generator, mechanism: Mechanism, about: _Shippe
         overrides["event"] = _events(random, mechanism, q, q_dot)
     if q is not None and not mechanism.independent_root_coordinates and random.random() < 0.12:
         overrides["controller"] = _controller(random, mechanism, q)
-        if "sample_time" in overrides["controller"]:  # every change of u is at an output instant
+        if "sample_time" in overrides["controller"]:  # u jumps at output instants only
             overrides["solver.output_dt"] = overrides["controller"]["sample_time"] / PER_SAMPLE
     else:
         overrides["controller"] = None
     return overrides
 
 
-def _start(random: np.random.Generator, mechanism: Mechanism, about: _Shipped) -> tuple[Array | None, Array]:
-    """q and q_dot; q is None where only the assembled configuration can be started from."""
+def _start(random: np.random.Generator, mechanism: Mechanism, ranges: _Ranges) -> tuple[Array | None, Array]:
+    """Return q and q_dot; q is None for a start from the assembled configuration."""
     slides = mechanism.tree.in_metres[mechanism.partition.q]
     unit = np.where(slides, 0.3 * mechanism.size, 1.0)
-    q_dot = random.uniform(-1, 1, mechanism.d) * about.speed * unit * random.choice([0.0, 0.1, 1.0, 1.0])
+    q_dot = random.uniform(-1, 1, mechanism.d) * ranges.speed * unit * random.choice([0.0, 0.1, 1.0, 1.0])
     if mechanism.splits_root or random.random() < 0.1:
         return None, q_dot
-    here = mechanism.independent_part(mechanism.q_tree)
-    for attempt in range(12):  # nearer and nearer
-        there = here + random.uniform(-1, 1, mechanism.d) * about.spread * unit * 0.75**attempt
-        found = sigma(mechanism, there)
-        if found.verdict == "converged":
-            return there, q_dot
-    return here, q_dot
+    assembled = mechanism.independent_part(mechanism.q_tree)
+    for attempt in range(12):  # closer with each attempt
+        target = assembled + random.uniform(-1, 1, mechanism.d) * ranges.spread * unit * 0.75**attempt
+        solution = sigma(mechanism, target)
+        if solution.verdict == "converged":
+            return target, q_dot
+    return assembled, q_dot
 
 
 def _events(random: np.random.Generator, mechanism: Mechanism, q: Array | None, q_dot: Array) -> list[dict[str, Any]]:
-    """One or two; at any value, at the start's own value (tangential when it starts at rest), or both at one value."""
+    """Return one or two events, in some cases at the initial value (tangential at rest) or both at one value."""
     k = int(random.integers(mechanism.d))
     of = str(random.choice(["q", "q_dot"]))
     start = q_dot[k] if of == "q_dot" else 0.0 if q is None else q[k]

@@ -1,4 +1,4 @@
-"""Time reversal: from the end of a conservative motion, with velocities turned around, back along its own past."""
+"""Time reversal: run a conservative motion back from its end with reversed velocities, and compare with its past."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ import numpy as np
 import ckc_pin
 from ckc_pin import Run
 from ckc_pin.errors import CkcError
-from scripts.experiments.fuzz.judge import Judge
 from scripts.experiments.fuzz.motions import Motion
+from scripts.experiments.fuzz.reference import ReferenceIntegrator
 
-__all__ = ["reversal"]
+__all__ = ["measure_reversal_error"]
 
-INSTANTS = 12  # of output, that it is run back over
+INSTANTS = 12  # output instants of the reversed run
 
 
-def reversal(run: Run, motion: Motion, judge: Judge, order: Sequence[int], doubtful: float) -> float:
-    """How far the run's own past is missed, over rtol; NaN where nothing is said.
+def measure_reversal_error(
+    run: Run, motion: Motion, reference: ReferenceIntegrator, order: Sequence[int], suspect_factor: float
+) -> float:
+    """Return the error of a reversed run against the run's own past, over rtol.
 
-    A way that magnifies errors much itself is left out, as pieces are: where it is off by more than `doubtful` rtol
-    the judge goes it too. So is one that stops.
+    It is NaN if the reversed run stops or is ill-conditioned. The latter is tested with the reference integrator if
+    the error exceeds `suspect_factor` rtol.
     """
     rtol = motion.overrides["solver.rtol"]
-    then = max(0, len(run.t) - 1 - INSTANTS)
-    span = float(run.t[-1] - run.t[then])
+    row = max(0, len(run.t) - 1 - INSTANTS)
+    span = float(run.t[-1] - run.t[row])
     if span <= 0:
         return np.nan
     q, v = run.q_tree[:, order], run.v_tree[:, order]
@@ -36,15 +38,16 @@ def reversal(run: Run, motion: Motion, judge: Judge, order: Sequence[int], doubt
     }
     overrides = {**motion.overrides, "initial": initial, "t_end": span, "event": [], "solver.output_dt": span}
     try:
-        back = ckc_pin.simulate(motion.scene, overrides)
+        returned = ckc_pin.simulate(motion.scene, overrides)
     except CkcError:
         return np.nan
-    if back.status != "done":
+    if returned.status != "done":
         return np.nan
-    off = float(judge.error(back.q_tree[-1:, order], back.v_tree[-1:, order], q[then][None], -v[then][None])[0])
-    if off > doubtful * rtol:
+    q_end, v_end = returned.q_tree[-1:, order], returned.v_tree[-1:, order]
+    error = float(reference.compute_error(q_end, v_end, q[row][None], -v[row][None])[0])
+    if error > suspect_factor * rtol:
         start, dt = (q[-1:], -v[-1:]), np.array([span])
-        end = judge.pieces(*start, dt, 1e-3 * rtol)
-        if not end.resolved[0] or judge.sensitive(*start, dt, end, np.array([True]))[0]:
+        end = reference.integrate_segments(*start, dt, 1e-3 * rtol)
+        if not end.resolved[0] or reference.find_ill_conditioned(*start, dt, end, np.array([True]))[0]:
             return np.nan
-    return off / rtol
+    return error / rtol

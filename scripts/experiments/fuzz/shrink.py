@@ -1,4 +1,4 @@
-"""A failing run made small: fewer keys, a later start, a shorter time, rounder numbers, as long as it fails alike."""
+"""Shrink a failing run: fewer keys, a later start, a shorter time, rounded numbers, with the same failure."""
 
 from __future__ import annotations
 
@@ -15,34 +15,34 @@ from scripts.experiments.fuzz.record import Record, run_motion
 __all__ = ["shrink"]
 
 NEEDED = ("formulation", "t_end", "solver.rtol", "solver.output_dt", "initial", "controller")
-MOST_TRIALS = 300
+MAX_TRIALS = 300
 
 
 def shrink(motion: Motion) -> Motion:
-    """The smallest motion found whose run fails as this one's does; the motion itself if it does not fail."""
+    """Return the smallest motion found that has the same failure; the motion itself if it does not fail."""
     record, run = run_motion(motion, thorough=True)
-    wanted, trials = _kind(record), 0
-    again = record.verdict != "done" or record.gross
-    while again and trials < MOST_TRIALS:
-        again = False
-        for overrides in _smaller(motion.overrides, record, run):
+    failure, trials = _classify_failure(record), 0
+    shrunk = record.verdict != "done" or record.gross
+    while shrunk and trials < MAX_TRIALS:
+        shrunk = False
+        for overrides in _simpler_overrides(motion.overrides, record, run):
             trials += 1
             smaller = replace(motion, overrides=overrides)
-            found, its_run = run_motion(smaller, thorough=True)
-            if _kind(found) == wanted:
-                motion, record, run, again = smaller, found, its_run, True
+            smaller_record, smaller_run = run_motion(smaller, thorough=True)
+            if _classify_failure(smaller_record) == failure:
+                motion, record, run, shrunk = smaller, smaller_record, smaller_run, True
                 break
     return motion
 
 
-def _kind(record: Record) -> tuple[str, bool, str]:
-    """What failing alike means: the verdict, and the message without its numbers."""
-    said = record.message if record.verdict in ("RAW", "stopped", "refused") else record.why
-    return record.verdict, record.off, re.sub(r"-?\d[\d.e+-]*", "#", said)[:40]
+def _classify_failure(record: Record) -> tuple[str, bool, str]:
+    """Return the kind of failure: the verdict, and the message without its numbers."""
+    message = record.message if record.verdict in ("EXCEPTION", "stopped", "refused") else record.fault
+    return record.verdict, record.failed_before_stop, re.sub(r"-?\d[\d.e+-]*", "#", message)[:40]
 
 
-def _smaller(overrides: Mapping[str, Any], record: Record, run: Run | None) -> Iterator[dict[str, Any]]:
-    """Simpler overrides, the boldest first."""
+def _simpler_overrides(overrides: Mapping[str, Any], record: Record, run: Run | None) -> Iterator[dict[str, Any]]:
+    """Yield simpler overrides, the largest simplifications first."""
     for key in overrides:
         if key not in NEEDED:
             yield {k: x for k, x in overrides.items() if k != key}
@@ -58,7 +58,7 @@ def _smaller(overrides: Mapping[str, Any], record: Record, run: Run | None) -> I
         for part in (0.98, 0.9, 0.7, 0.5, 0.3):
             k = run.at(part * record.worst_t)
             if run.t[k] > 0.1 * overrides["t_end"]:
-                yield {**overrides, "initial": _state(run, k), "t_end": overrides["t_end"] - float(run.t[k])}
+                yield {**overrides, "initial": _initial_state(run, k), "t_end": overrides["t_end"] - float(run.t[k])}
     if overrides["t_end"] != (short := float(f"{overrides['t_end']:.2g}")):
         yield {**overrides, "t_end": short}
     if overrides["solver.rtol"] != (round_ := float(f"{overrides['solver.rtol']:.0e}")):
@@ -72,7 +72,7 @@ def _smaller(overrides: Mapping[str, Any], record: Record, run: Run | None) -> I
                     yield {**overrides, "initial": initial}
 
 
-def _state(run: Run, k: int) -> dict[str, Any]:
-    """A run's state as a start; all coordinates, so that the branch is told."""
+def _initial_state(run: Run, k: int) -> dict[str, Any]:
+    """Return row k of a run as initial values. All coordinates are included, so that they select the branch."""
     q = dict(zip(run.coordinates, run.q_tree[k].tolist(), strict=True))
     return {"q": q, "q_dot": {name: float(run.v_tree[k, run.column(name)]) for name in run.independent}}

@@ -1,4 +1,4 @@
-"""Rotations and cross products over arrays with any leading axes; the judge's own, so that it shares nothing."""
+"""Rotations and cross products over arrays with any leading axes, independent of the package."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ IntArray = NDArray[np.intp]
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis; np.cross costs several times as much on small arrays."""
+    """Return the cross product along the last axis. np.cross takes several times as long on small arrays."""
     a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
     b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
@@ -23,17 +23,17 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Scalar product along the last axis."""
+    """Return the scalar product along the last axis."""
     return np.einsum("...i,...i->...", a, b)
 
 
 def apply(R: Array, a: Array) -> Array:
-    """R a along the last axes."""
+    """Return R a along the last axes."""
     return (R @ a[..., None])[..., 0]
 
 
 def rpy(angles: Array | list[float] | tuple[float, float, float]) -> Array:
-    """URDF's roll, pitch, yaw: about the fixed x, y, z axes in this order."""
+    """Return the rotation matrix of URDF's roll, pitch and yaw: about the fixed x, y and z axes in this order."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
     return np.array(
         [
@@ -45,14 +45,14 @@ def rpy(angles: Array | list[float] | tuple[float, float, float]) -> Array:
 
 
 def turn(axis: Array, angle: Array) -> Array:
-    """Rotation by angles (P,) about one unit axis (3,): (P, 3, 3)."""
+    """Return rotations (P, 3, 3) by angles (P,) about one unit axis (3,)."""
     K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.eye(3) + s * K + (1 - c) * (K @ K)
 
 
 def rotation(vector: Array) -> Array:
-    """Rotations of rotation vectors (P, 3)."""
+    """Return rotation matrices (P, 3, 3) of rotation vectors (P, 3)."""
     angle = np.linalg.norm(vector, axis=1)
     a = vector / np.where(angle > 0, angle, 1.0)[:, None]
     K = np.zeros((len(a), 3, 3))
@@ -63,7 +63,7 @@ def rotation(vector: Array) -> Array:
 
 
 def rotation_vector(R: Array) -> Array:
-    """Rotation vectors of rotations (P, 3, 3) well below half a turn."""
+    """Return rotation vectors (P, 3) of rotation matrices (P, 3, 3) well below half a turn."""
     s = 0.5 * np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
     sine, cosine = np.linalg.norm(s, axis=1), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1)
     angle = np.arctan2(sine, cosine)
@@ -71,10 +71,13 @@ def rotation_vector(R: Array) -> Array:
 
 
 def perpendicular(a: Array) -> tuple[Array, Array]:
-    """e1, e2 as docs/reference/mechanism.md says: cyclic for a coordinate axis, else across the least aligned one."""
-    along = int(np.argmax(np.abs(a)))
-    if a[along] > 0 and np.count_nonzero(a) == 1:
-        return np.eye(3)[(along + 1) % 3], np.eye(3)[(along + 2) % 3]
+    """Return e1 and e2 perpendicular to the axis a, as defined in docs/reference/mechanism.md.
+
+    For a coordinate axis they are the next two. Otherwise e1 = a x (the coordinate axis least aligned with a).
+    """
+    main = int(np.argmax(np.abs(a)))
+    if a[main] > 0 and np.count_nonzero(a) == 1:
+        return np.eye(3)[(main + 1) % 3], np.eye(3)[(main + 2) % 3]
     e1 = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
     e1 /= np.linalg.norm(e1)
     return e1, np.cross(a, e1)

@@ -1,1 +1,1 @@
-"""Random motions with stops, impacts and dry friction, judged by references that share nothing with the package."""
+"""Random motions with stops, impacts and dry friction, compared with references independent of the package."""

@@ -1,4 +1,4 @@
-"""Random mechanisms with stops, impacts and dry friction: one case from a seed, by kind."""
+"""Cases of random motions with stops, impacts and dry friction, drawn by kind from a seed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scripts.experiments.fuzz.contact.stops import Contact, with_contacts
+from scripts.experiments.fuzz.contact.stops import Contact, add_contacts
 
 __all__ = ["Case", "Draw", "choose_restitutions", "mass_ratio"]
 
@@ -19,9 +19,10 @@ RTOL = 1e-11
 
 @dataclass(frozen=True)
 class Case:
-    """One motion and what is known of it beforehand.
+    """One motion and its expected properties.
 
-    `texts` are the mechanism's files without stops and friction, which the references read; `contacts` says those.
+    `texts` are the mechanism's files without stops and friction, as the references read them. `contacts` has the stops
+    and friction by joint.
     """
 
     seed: int
@@ -29,17 +30,17 @@ class Case:
     texts: dict[str, str]
     contacts: dict[str, Contact]
     overrides: dict[str, Any]  # of the scene
-    conservative: bool = True  # nothing but stops and friction changes the energy
-    linear: bool = False  # every link translates: `slides.py` is an exact reference
-    jammed: bool = False  # the stops leave no motion: at rest from the first instant
+    conservative: bool = True  # only stops and friction change the energy
+    linear: bool = False  # all links translate, so `slides.py` is an exact reference
+    jammed: bool = False  # the stops prevent all motion after t = 0
     quiet: frozenset[str] = frozenset()  # joints without events after `quiet_after`
     quiet_after: float = 0.0
-    compares_steps: bool = False  # stops and friction must not change the number of steps
+    compares_steps: bool = False  # stops and friction must not increase the number of steps
 
     def write(self, folder: Path, *, contacts: bool = True) -> Path:
         """Write the files to a folder, with stops and friction or without."""
         folder.mkdir(parents=True, exist_ok=True)
-        files = with_contacts(self.texts, self.contacts) if contacts else self.texts
+        files = add_contacts(self.texts, self.contacts) if contacts else self.texts
         for name, text in {**files, "default.scene.toml": SCENE}.items():
             (folder / name).write_text(text, encoding="utf-8")
         return folder
@@ -49,7 +50,7 @@ Draw = Callable[[int, np.random.Generator], Case]
 
 
 def mass_ratio(random: np.random.Generator, count: int) -> np.ndarray:
-    """Masses: equal, powers of ten or anything, 1 to 1e4 apart."""
+    """Return masses that are equal, powers of ten, or random, with ratios up to 1e4."""
     draw = random.random()
     if draw < 0.3:
         return np.full(count, float(random.choice([1.0, 1.0, random.uniform(0.1, 10)])))
@@ -59,7 +60,7 @@ def mass_ratio(random: np.random.Generator, count: int) -> np.ndarray:
 
 
 def choose_restitutions(random: np.random.Generator, count: int) -> list[float]:
-    """Restitutions 0 to 1: often 0, 1 or all equal."""
+    """Return restitutions from 0 to 1, often 0, 1 or all equal."""
 
     def choose() -> float:
         return float(random.choice([0.0, 1.0, 0.5, random.uniform(0, 1)], p=[0.3, 0.2, 0.15, 0.35]))

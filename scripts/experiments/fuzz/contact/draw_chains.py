@@ -1,4 +1,4 @@
-"""Pendulum chains, closed chains and jammed ones, from the random mechanisms of the suite, with stops and friction."""
+"""Pendulum chains, closed chains and jammed chains with stops and friction, from the suite's random mechanisms."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ CLOSED_DURATION = 0.3  # s at a size of 1 m, times sqrt(size)
 
 
 def draw_pendulums(seed: int, random: np.random.Generator) -> Case:
-    """One to four links hung on one another, planar or not."""
+    """Draw a serial chain of one to four links, planar or spatial."""
     builder = Builder(random, "pendulums")
     down = random.normal(size=3)
     builder.gravity = 9.81 * down / np.linalg.norm(down) * (random.random() < 0.8)
-    flat = rotation(random.normal(size=(1, 3)))[0][2] if random.random() < 0.6 else None
+    plane_normal = rotation(random.normal(size=(1, 3)))[0][2] if random.random() < 0.6 else None
     count = int(random.integers(1, 5))
     parent = "base"
     for k, ratio in enumerate(mass_ratio(random, count)):
-        axis = flat if flat is not None else builder.vector(1.0)
-        at = builder.vector(0.6, flat) if k else np.zeros(3)
-        parent = builder.joint(f"a{k + 1}", "continuous", parent, at, axis / np.linalg.norm(axis), flat)
+        axis = plane_normal if plane_normal is not None else builder.random_vector(1.0)
+        at = builder.random_vector(0.6, plane_normal) if k else np.zeros(3)
+        parent = builder.add_joint(f"a{k + 1}", "continuous", parent, at, axis / np.linalg.norm(axis), plane_normal)
         part = builder.parts[-1]
         part.inertia, part.mass = part.inertia * ratio / part.mass, float(ratio)
-    return _draw(seed, random, "pendulums", builder.texts(), 0.6)
+    return _draw(seed, random, "pendulums", builder.to_files(), 0.6)
 
 
 def draw_closed(seed: int, random: np.random.Generator) -> Case:
-    """Closed chains of every kind of the suite, without dampers; joints that loops hold still are among them."""
+    """Draw a closed chain of any kind of the suite, without dampers. Loops may prevent some joints from moving."""
     texts = _random_closed(seed, random)
     return _draw(seed, random, "closed chains", texts, CLOSED_DURATION)
 
 
 def draw_jammed(seed: int, random: np.random.Generator) -> Case:
-    """Closed chains of one freedom that two of their stops leave no motion; thrown, they are at rest at once."""
+    """Draw a closed chain with one freedom that is jammed by two stops, with a non-zero initial rate."""
     for attempt in range(200):
         texts = _random_closed(seed * 1000 + attempt, random)
         mechanism = _loaded(texts)
@@ -70,7 +70,7 @@ def draw_jammed(seed: int, random: np.random.Generator) -> Case:
         rate = {mechanism.independent[0]: float(random.choice([-1, 1]) * random.uniform(0.2, 3))}
         overrides = _overrides(mechanism, rate, 0.05)
         return Case(seed, "jammed chains", texts, contacts, overrides, jammed=True)
-    raise RuntimeError(f"seed {seed}: no mechanism of one freedom in 200 draws")
+    raise RuntimeError(f"seed {seed}: none of 200 mechanisms has one freedom and two moving joints")
 
 
 def _random_closed(seed: int, random: np.random.Generator) -> dict[str, str]:
@@ -82,7 +82,7 @@ def _random_closed(seed: int, random: np.random.Generator) -> dict[str, str]:
 
 
 def _scale_masses(urdf: str, random: np.random.Generator) -> str:
-    """Links 1 to 1e4 times as heavy."""
+    """Multiply the inertia of each link by a factor from 1 to 1e4."""
 
     def scaled(link: re.Match[str]) -> str:
         factor = float(10 ** random.uniform(0, 4))
@@ -116,7 +116,7 @@ def _overrides(mechanism: Mechanism, rates: Mapping[str, float], duration: float
 
 
 def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, str], duration: float) -> Case:
-    """Give the joints of a mechanism stops near where they are, at it in a fifth, and friction."""
+    """Add friction to joints of a mechanism, and stops close to their coordinates, one in five without a gap."""
     mechanism = _loaded(texts)
     if mechanism is None:
         return Case(seed, kind, texts, {}, {"t_end": 0.01, "solver.rtol": RTOL, "initial": {"at": "assembled"}})
@@ -126,11 +126,11 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
     size = np.where(size > 1e-9 * size.max(), size, size.max()) if size.any() else np.ones(mechanism.n)
     names = [name for name in tree.index if name not in tree.free_coordinates]
     e = choose_restitutions(random, len(names))
-    rubs, stops = random.choice([0.0, 0.0, 0.3, 0.8]), random.choice([0.3, 0.6, 1.0])
+    friction_share, stops = random.choice([0.0, 0.0, 0.3, 0.8]), random.choice([0.3, 0.6, 1.0])
     contacts = {}
     for name, restitution in zip(names, e, strict=True):
         k = tree.index[name]
-        friction = float(size[k] * 10 ** random.uniform(-2, 0)) if random.random() < rubs else 0.0
+        friction = float(size[k] * 10 ** random.uniform(-2, 0)) if random.random() < friction_share else 0.0
         lower, upper = -np.inf, np.inf
         if random.random() < stops:
             below, above = random.uniform(0.01, 0.3, 2) * reach[k]
@@ -154,9 +154,9 @@ def _draw(seed: int, random: np.random.Generator, kind: str, texts: dict[str, st
 
 
 def _controller(mechanism: Mechanism, random: np.random.Generator, size: Array) -> dict[str, Any]:
-    """A set-point controller, its torques mostly at their limits."""
+    """Draw a set-point controller whose torques are often at their limits."""
     here = mechanism.independent_part(mechanism.q_tree)
-    for attempt in range(12):  # nearer and nearer
+    for attempt in range(12):  # closer with each attempt
         there = here + random.uniform(-0.5, 0.5, mechanism.d) * 0.6**attempt
         if sigma(mechanism, there).verdict == "converged":
             break
@@ -172,7 +172,7 @@ def _controller(mechanism: Mechanism, random: np.random.Generator, size: Array) 
 def _with_motors(
     texts: Mapping[str, str], mechanism: Mechanism, random: np.random.Generator, size: Array
 ) -> dict[str, str]:
-    """Motors with limits of their own on the independent joints, in half of the cases."""
+    """Add motors with torque limits to the independent joints, in half of the cases."""
     if random.random() < 0.5:
         return dict(texts)
     tables = "".join(

@@ -1,4 +1,4 @@
-"""What does not move beside what does: trusses that are carried along, and grippers closed on their stops."""
+"""Mechanisms with parts at rest on moving links: trusses on a carrier, and grippers closed on their stops."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _joint(name: str, kind: str, parent: str, child: str, xyz: Array, rpy: Array
 
 
 def draw_truss(seed: int, random: np.random.Generator) -> Case:
-    """Two bars that form a triangle with a spinning link: their pins cannot move, whatever acts in them."""
+    """Draw a truss: two bars that form a triangle with a spinning link, so that their pins cannot move."""
     while True:
         a, b, c = random.uniform(0.4, 1, 3)
         if max(a, b, c) < 0.95 * (a + b + c - max(a, b, c)):
@@ -75,10 +75,10 @@ def draw_truss(seed: int, random: np.random.Generator) -> Case:
 
 
 def draw_gripper(seed: int, random: np.random.Generator) -> Case:
-    """Fingers at rest on their stops at the hand of a moving arm.
+    """Draw fingers at rest on their stops, at the end of a moving arm.
 
-    Either nothing presses them there: coupled fingers of equal mass about one point, whose forces cancel. Or a closing
-    force does, many times what the arm's motion makes. Either way they stay.
+    The fingers stay at rest for one of two reasons. Either they are coupled, have equal masses and are arranged around
+    one point, so that their inertial forces cancel. Or a closing force exceeds the inertial forces many times.
     """
     count = int(random.choice([2, 2, 3]))
     pressed = random.random() < 0.5
@@ -97,7 +97,8 @@ def draw_gripper(seed: int, random: np.random.Generator) -> Case:
         parent = f"arm{k}"
     mass, at = float(10 ** random.uniform(-2.5, -0.5)), np.array([0.0, 0.0, 0.06])
     names = [f"f{k}" for k in range(count)]
-    flips = random.choice([1.0, 1.0, -1.0], count)  # an axis that points to closed: the finger rests on its upper stop
+    # an axis of 1 points to closed: the finger rests on its upper stop
+    flips = random.choice([1.0, 1.0, -1.0], count)
     for k, name in enumerate(names):
         turn, axis = np.array([0.0, 0.0, 2 * np.pi * k / count]), np.array([0.0, flips[k], 0.0])
         parts.append(_link(f"finger{k}", zero, mass, 1e-4 * mass))
@@ -107,7 +108,7 @@ def draw_gripper(seed: int, random: np.random.Generator) -> Case:
     mechanism += f"independent = {toml_value(independent)}\n"
     couplings = [(k, 0) for k in range(1, count)] if coupled else []
     if len(couplings) == 2 and random.random() < 0.4:
-        couplings.append((2, 1))  # follows from the others
+        couplings.append((2, 1))  # redundant
     for k, of in couplings:
         ratio = float(flips[k] * flips[of])
         mechanism += f'[[coupling]]\njoint = "{names[k]}"\nother = "{names[of]}"\nratio = {ratio}\n'
@@ -116,16 +117,16 @@ def draw_gripper(seed: int, random: np.random.Generator) -> Case:
             force = float(-flips[k] * mass * random.uniform(400, 4000))
             mechanism += f'[[force]]\njoint = "{names[k]}"\nvalue = {force!r}\n'
     e = choose_restitutions(random, count)
-    opens = float(random.choice([-1, 1])) if not pressed else 1.0  # nothing presses: rests at the open end as well
+    opens = float(random.choice([-1, 1])) if not pressed else 1.0  # without a closing force also at rest when open
     stopped = [k for k in range(count) if not coupled or random.random() < 0.8] or [0]
     contacts = {}
     for k in range(count):
         limits = (-np.inf, np.inf)
         if k in stopped:
             limits = (0.0, 0.04) if opens * flips[k] > 0 else (-0.04, 0.0)
-        rubs = float(mass * random.uniform(0.1, 10)) if random.random() < 0.2 else 0.0
-        if k in stopped or rubs:
-            contacts[names[k]] = Contact(rubs, *limits, e[k])
+        friction = float(mass * random.uniform(0.1, 10)) if random.random() < 0.2 else 0.0
+        if k in stopped or friction:
+            contacts[names[k]] = Contact(friction, *limits, e[k])
     rates = {f"a{k}": float(random.normal() * 2) for k in range(moved)}
     overrides = {
         "t_end": 0.5, "solver.rtol": float(10 ** random.uniform(-11, -4)),

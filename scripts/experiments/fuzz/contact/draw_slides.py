@@ -1,4 +1,4 @@
-"""Stacks, trees and racks of slides, with stops, friction, couplings, jammed ones among them."""
+"""Stacks, trees and racks of prismatic joints, with stops, friction and couplings; some racks are jammed."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _case(
 
 
 def _start(random: np.random.Generator, count: int) -> tuple[Array, Array]:
-    """Gaps to the lower stop, some of them closed, and rates, some of them zero."""
+    """Draw gaps to the lower stops, some of them closed, and rates, some of them zero."""
     closed = random.random(count) < random.choice([0.0, 0.3, 0.8])
     rests = random.random(count) < random.choice([0.2, 0.8])
     q = np.where(closed, 0.0, random.choice([random.uniform(0.01, 0.5, count), np.full(count, 0.25)]))
@@ -62,7 +62,7 @@ def _start(random: np.random.Generator, count: int) -> tuple[Array, Array]:
 
 def _contacts(random: np.random.Generator, q: Array, weight: float) -> dict[str, Contact]:
     e = choose_restitutions(random, len(q))
-    rubs = random.random() < 0.4
+    has_friction = random.random() < 0.4
     contacts = {}
     for k in range(len(q)):
         lower = 0.0 if random.random() < 0.9 else -np.inf
@@ -73,13 +73,13 @@ def _contacts(random: np.random.Generator, q: Array, weight: float) -> dict[str,
         )
         if upper <= lower:
             upper = np.inf
-        friction = float(weight * 10 ** random.uniform(-2, 0.5)) if rubs and random.random() < 0.6 else 0.0
+        friction = float(weight * 10 ** random.uniform(-2, 0.5)) if has_friction and random.random() < 0.6 else 0.0
         contacts[f"x{k}"] = Contact(friction, lower, upper, e[k])
     return contacts
 
 
 def draw_stack(seed: int, random: np.random.Generator) -> Case:
-    """Bodies one above the other on a line; each stands on the stop of the one below."""
+    """Draw a stack of bodies on a vertical line; each rests on the stop of the body below."""
     count = int(random.integers(1, 6))
     masses = mass_ratio(random, count)
     gravity = np.array([0.0, 0.0, -G]) * float(random.choice([0.0, 1.0, 1.0, 0.1]))
@@ -90,7 +90,7 @@ def draw_stack(seed: int, random: np.random.Generator) -> Case:
 
 
 def draw_tree(seed: int, random: np.random.Generator) -> Case:
-    """Slides in any directions on one another: impacts at one stop change the rates of all."""
+    """Draw a tree of prismatic joints in random directions; an impact at one stop changes all rates."""
     count = int(random.integers(2, 6))
     masses = mass_ratio(random, count)
     parents = [int(random.integers(-1, k)) for k in range(count)]
@@ -110,7 +110,7 @@ def draw_tree(seed: int, random: np.random.Generator) -> Case:
 
 
 def draw_racks(seed: int, random: np.random.Generator) -> Case:
-    """Slides geared to each other, by redundant couplings too, jammed between two stops in a third of the cases."""
+    """Draw coupled prismatic joints, some with redundant couplings; a third of the cases is jammed by two stops."""
     jammed = random.random() < 0.35
     count = int(random.integers(2, 5))
     masses = mass_ratio(random, count)
@@ -139,9 +139,9 @@ def draw_racks(seed: int, random: np.random.Generator) -> Case:
     contacts = {}
     for k in range(count):
         lower, upper = (0.0, np.inf) if jammed else (q[k] - random.uniform(0, 0.3), q[k] + random.uniform(0, 0.3))
-        rubs = not jammed and random.random() < 0.2
+        has_friction = not jammed and random.random() < 0.2
         contacts[f"x{k}"] = Contact(
-            float(masses.min() * random.uniform(0, 10)) if rubs else 0.0, float(lower), float(upper), e[k]
+            float(masses.min() * random.uniform(0, 10)) if has_friction else 0.0, float(lower), float(upper), e[k]
         )
     case = _case(
         seed, random, "jammed racks" if jammed else "racks", _urdf(axes, masses, parents),

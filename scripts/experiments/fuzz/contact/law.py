@@ -1,12 +1,12 @@
-"""The impact law as a reference: generalized reflections with Newton's restitution, in NumPy and SciPy alone.
+"""Reference implementation of the impact law with NumPy and SciPy: reflections with Newton's restitution.
 
-One instant is answered in rounds. All stops that approach (gap velocity < 0) are reflected together,
+An impact is computed in rounds. All approaching stops (gap velocity < 0) are reflected together,
 
     v+ = v_p - e v_o,   v_p = projection of v- onto {gap velocities >= 0} in the metric of D,   v_o = v- - v_p.
 
-Where their restitutions differ, the group with the smallest one is a round of its own. Stops that rest (gap velocity 0)
-belong to the cone too where they do not throw back: those with e = 0 in every round, all of them in a round with e = 0.
-Rounds follow until no stop approaches.
+Stops are reflected in groups of equal restitution, the smallest restitution first. The cone of a group also includes
+resting stops (gap velocity 0) with e = 0, and all resting stops if the group has e = 0. Rounds are repeated until no
+stop approaches.
 By Moreau's decomposition v_p and v_o are orthogonal in the metric of D, so a reflection loses (1 - e^2)/2 |v_o|^2 >= 0.
 Friction has no impulse.
 """
@@ -20,16 +20,16 @@ from scipy.optimize import lsq_linear, nnls
 
 from scripts.experiments.fuzz.spatial import Array
 
-__all__ = ["Impact", "answer_impact", "project", "push_within_bounds"]
+__all__ = ["Impact", "apply_impact_law", "minimize_energy_with_bounds", "project"]
 
 MAX_ROUNDS = 500
-ROUNDING = 1e-12  # of |v|_D: slower gap velocities are zero
-DOUBTFUL = 1e-9  # of |v|_D: slower ones may count as zero or as an approach
+ROUNDING = 1e-12  # relative to |v|_D; smaller gap velocities are zero
+DOUBTFUL = 1e-9  # relative to |v|_D; smaller gap velocities may count as zero or as approaching
 
 
 @dataclass
 class Impact:
-    """The answer to one instant: velocity after it, energy lost, which stops were hit, and whether it is certain."""
+    """Result of an impact: velocity after it, energy lost, stops that were hit, and whether the result is certain."""
 
     v: Array
     lost: float = 0.0
@@ -38,7 +38,7 @@ class Impact:
 
 
 def project(L: Array, N: Array, v: Array) -> tuple[Array, Array]:
-    """Project v onto {N v >= 0} in the metric of D = L L^T; return the projection and the rest of v."""
+    """Project v onto {N v >= 0} in the metric of D = L L^T; return the projection and the residual."""
     G = np.linalg.solve(L, N.T)
     size = float(np.linalg.norm(L.T @ v))
     if size == 0.0 or not len(N):
@@ -49,14 +49,13 @@ def project(L: Array, N: Array, v: Array) -> tuple[Array, Array]:
     return v + outward, -outward
 
 
-def answer_impact(
+def apply_impact_law(
     D: Array, N: Array, v: Array, e: Array, *, rechoose: bool = False, max_rounds: int = MAX_ROUNDS
 ) -> Impact:
-    """Apply the law to the stops with gap zero: N (stops, n) are their gap velocities' rows, e their restitutions.
+    """Apply the impact law to closed stops with Jacobian N (stops, n) of their gap velocities and restitutions e.
 
-    `rechoose`: the stops of a round's later groups are those that approach when their turn comes. Otherwise they are
-    those that approached when the round began. The law leaves this open, and both readings lose energy alike. After
-    `max_rounds` the projection ends it, and the answer is not certain.
+    `rechoose`: select the approaching stops again before each group of a round, not once for a round. The law allows
+    both. After `max_rounds` the velocity is projected onto the cone, and the result is not certain.
     """
     L = np.asarray(np.linalg.cholesky(D), float)
     out = Impact(v.copy())
@@ -83,8 +82,11 @@ def answer_impact(
     return out
 
 
-def push_within_bounds(L: Array, rows: Array, u: Array, low: Array, high: Array) -> Array:
-    """Add impulses along rows (or forces, u an acceleration) that leave the least energy, D = L L^T, within bounds."""
+def minimize_energy_with_bounds(L: Array, rows: Array, u: Array, low: Array, high: Array) -> Array:
+    """Add bounded impulses along rows that minimize the energy of u in the metric of D = L L^T.
+
+    If u is an acceleration, `low` and `high` are bounds of forces (Gauss' principle).
+    """
     if not len(rows):
         return u
     roots, target = np.linalg.solve(L, rows.T), L.T @ u

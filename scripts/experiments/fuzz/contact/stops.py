@@ -1,4 +1,4 @@
-"""Stops and friction of joints, as a mechanism's files say them and as the references read them."""
+"""Stops and friction of joints, for a mechanism's files and for the references."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Contact", "JointStop", "contacts_of", "with_contacts", "with_limits"]
+__all__ = ["Contact", "JointStop", "add_contacts", "list_joint_stops", "set_limits"]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Stops and friction of one joint; without stops where both limits are infinite."""
+    """Stops and friction of one joint. It has no stops if both limits are infinite."""
 
     friction: float = 0.0
     lower: float = -np.inf
@@ -35,11 +35,11 @@ class JointStop:
     restitution: float
 
 
-FAR = 1e4  # rad, m: a limit that is not there
+NO_LIMIT = 1e4  # rad or m: a limit that is not reached
 
 
-def contacts_of(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[JointStop]:
-    """All stops, by coordinate."""
+def list_joint_stops(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[JointStop]:
+    """Return the stops in the order of the coordinates."""
     stops = []
     for column, label in enumerate(labels):
         contact = contacts.get(label)
@@ -52,27 +52,29 @@ def contacts_of(labels: Sequence[str], contacts: Mapping[str, Contact]) -> list[
     return stops
 
 
-def with_contacts(texts: Mapping[str, str], contacts: Mapping[str, Contact]) -> dict[str, str]:
-    """A mechanism's files with limits in the URDF and [[joint]] tables for stops and friction."""
-    made = dict(texts)
+def add_contacts(texts: Mapping[str, str], contacts: Mapping[str, Contact]) -> dict[str, str]:
+    """Return a mechanism's files with limits in the URDF and [[joint]] tables for stops and friction."""
+    files = dict(texts)
     for name, contact in contacts.items():
         table = f'\n[[joint]]\nname = "{name}"\n'
         if contact.friction:
             table += f"friction = {contact.friction!r}\n"
         if contact.stops:
             table += f"stops = true\nrestitution = {contact.restitution!r}\n"
-            lower, upper = max(contact.lower, -FAR), min(contact.upper, FAR)
-            for file in [file for file in made if file.endswith(".urdf")]:
-                made[file] = with_limits(made[file], name, lower, upper)
-        made["mechanism.toml"] += table
-    return made
+            lower, upper = max(contact.lower, -NO_LIMIT), min(contact.upper, NO_LIMIT)
+            for file in [file for file in files if file.endswith(".urdf")]:
+                files[file] = set_limits(files[file], name, lower, upper)
+        files["mechanism.toml"] += table
+    return files
 
 
-def with_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
-    """Give a joint of a URDF limits, if it is there."""
-    before, found, after = urdf.partition(f'<joint name="{joint}"')
-    if not found:
+def set_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
+    """Return a URDF with limits of a joint; unchanged if it has no such joint."""
+    before, tag, after = urdf.partition(f'<joint name="{joint}"')
+    if not tag:
         return urdf
-    own, end, rest = after.partition("</joint>")
-    own = re.sub(r"<limit[^>]*/>", "", own).replace('type="continuous"', 'type="revolute"')
-    return f'{before}{found}{own}<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>{end}{rest}'
+    body, closing, remainder = after.partition("</joint>")
+    body = re.sub(r"<limit[^>]*/>", "", body).replace('type="continuous"', 'type="revolute"')
+    return (
+        f'{before}{tag}{body}<limit lower="{lower!r}" upper="{upper!r}" effort="1" velocity="1"/>{closing}{remainder}'
+    )

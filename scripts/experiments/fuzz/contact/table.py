@@ -1,4 +1,4 @@
-"""Records of contact cases as a table by kind, with the seeds of what is wrong."""
+"""Table of contact cases by kind, followed by the seeds of faults by category."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from collections.abc import Sequence
 
 from scripts.experiments.fuzz.contact.record import Record
 
-__all__ = ["CATEGORIES", "table"]
+__all__ = ["CATEGORIES", "format_table"]
 
 CATEGORIES = {
-    "raw": "an exception that is no CkcError",
-    "refused": "a scene that should run is refused",
+    "exception": "an exception other than CkcError",
+    "refused": "a valid scene is refused",
     "stopped": "stopped, with joint and reason",
     "unnamed": "stopped without naming a joint, or at a limit of the solver",
     "grown": "done, with more energy than at the start",
     "energy": "done, energy + dissipated is not constant",
-    "dissipated": "dissipated falls",
-    "limits": "a joint beyond its stop, a loop open, or a torque beyond its limit",
+    "dissipated": "dissipated decreases",
+    "limits": "a joint beyond its stop, an open loop, or a torque beyond its limit",
     "rest": "jammed, but moving",
     "quiet": "events of joints that cannot move or rest on their stops",
-    "slow": "more than three times the steps",
-    "formulations": "formulations differ, in events or states",
-    "reference": "not as the event-driven reference",
-    "stepping": "not as the time-stepping scheme",
-    "rate event": "an event on a rate is not met at the impact that jumps over its value",
+    "slow": "more than three times the steps without stops and friction",
+    "formulations": "events or states differ between formulations",
+    "reference": "events or states differ from the event-driven reference",
+    "stepping": "states differ from the time-stepping scheme",
+    "rate event": "an impact that jumps over the value of an event on a rate does not trigger it",
 }
 WIDTH = {name: max(6, len(name)) for name in CATEGORIES}
-MOST_SEEDS = 12
+MAX_GROUPS = 12
 
 
-def table(records: Sequence[Record]) -> str:
-    """The whole report as text."""
+def format_table(records: Sequence[Record]) -> str:
+    """Return the report of a suite as text."""
     lines = [
         f"{'kind':15s} {'cases':>5s} {'runs':>6s} {'ok':>5s} {'events':>7s} {'agreed':>7s} {'magn':>5s} {'ref':>5s} "
         + " ".join(f"{name:>{WIDTH[name]}s}" for name in CATEGORIES)
@@ -47,26 +47,26 @@ def table(records: Sequence[Record]) -> str:
 
 
 def _summary(records: Sequence[Record]) -> str:
-    """The shares that are asked for: runs that stopped, that gained energy, and formulations that agree."""
+    """Return the shares of stopped runs, of runs that gained energy, and of formulations that agree."""
     runs = sum(record.runs for record in records)
-    count = Counter(x.category for record in records for x in record.findings)
+    count = Counter(x.category for record in records for x in record.faults)
     stopped = count["stopped"] + count["unnamed"]
     compared = [record for record in records if record.compared]
-    agreed = sum(not any(x.category == "formulations" for x in record.findings) for record in compared)
+    agreed = sum(not any(x.category == "formulations" for x in record.faults) for record in compared)
     return (
-        f"{runs} runs: {stopped} stopped ({100 * stopped / max(1, runs):.2f} %), {count['unnamed']} of them naming"
-        f" none; {count['raw']} raw exceptions; {count['grown']} done with energy grown; formulations agree in"
-        f" {100 * agreed / max(1, len(compared)):.2f} % of {len(compared)} cases"
+        f"{runs} runs: {stopped} stopped ({100 * stopped / max(1, runs):.2f} %), {count['unnamed']} of them without"
+        f" naming a joint; {count['exception']} unexpected exceptions; {count['grown']} with growing energy;"
+        f" formulations agree in {100 * agreed / max(1, len(compared)):.2f} % of {len(compared)} cases"
     )
 
 
 def _line(kind: str, records: Sequence[Record]) -> str:
-    count = Counter(category for record in records for category in {x.category for x in record.findings})
+    count = Counter(category for record in records for category in {x.category for x in record.faults})
     compared = [record for record in records if record.compared]
-    agreed = sum(not any(x.category == "formulations" for x in record.findings) for record in compared)
+    agreed = sum(not any(x.category == "formulations" for x in record.faults) for record in compared)
     share = f"{100 * agreed / len(compared):.1f}%" if compared else "-"
     return (
-        f"{kind:15s} {len(records):5d} {sum(r.runs for r in records):6d} {sum(not r.findings for r in records):5d}"
+        f"{kind:15s} {len(records):5d} {sum(r.runs for r in records):6d} {sum(not r.faults for r in records):5d}"
         f" {sum(r.events for r in records):7d} {share:>7s} {sum(r.magnified for r in records):5d}"
         f" {sum(r.referenced for r in records):5d} "
         + " ".join(f"{count[name]:>{WIDTH[name]}d}" for name in CATEGORIES)
@@ -75,20 +75,20 @@ def _line(kind: str, records: Sequence[Record]) -> str:
 
 
 def _category(category: str, meaning: str, records: Sequence[Record]) -> list[str]:
-    found = [(record, x) for record in records for x in record.findings if x.category == category]
-    if not found:
+    matches = [(record, x) for record in records for x in record.faults if x.category == category]
+    if not matches:
         return []
-    seeds = sorted({record.seed for record, _ in found})
+    seeds = sorted({record.seed for record, _ in matches})
     lines = [
         f"{category}: {meaning}",
         f"  {len(seeds)} seeds: {' '.join(map(str, seeds[:40]))}{' ...' if len(seeds) > 40 else ''}",
     ]
     texts: dict[str, list[tuple[Record, str, str]]] = {}
-    for record, x in found:
+    for record, x in matches:
         texts.setdefault(re.sub(r"-?\d[\d.e+-]*", "#", f"{record.kind}: {x.text}")[:70], []).append(
             (record, x.formulation, x.text)
         )
-    for alike in sorted(texts.values(), key=len, reverse=True)[:MOST_SEEDS]:
-        record, formulation, text = alike[0]
-        lines.append(f"  {len(alike):4d}  seed {record.seed} {record.kind} ({formulation}): {text[:230]}")
+    for group in sorted(texts.values(), key=len, reverse=True)[:MAX_GROUPS]:
+        record, formulation, text = group[0]
+        lines.append(f"  {len(group):4d}  seed {record.seed} {record.kind} ({formulation}): {text[:230]}")
     return [*lines, ""]
