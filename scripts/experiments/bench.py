@@ -30,7 +30,7 @@ from ckc_pin.scene.scene import list_catalogue
 ROOT = Path(__file__).resolve().parents[2]
 INERT = [{"coordinate": "theta_1", "value": 50.0}]
 FORMULATIONS = ("dae", "reduced", "spf")
-LINES = 7000
+MAX_LINES = 7000
 CIRCLE = {
     "controller.desired": {"point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 1.0}},
     "initial": {"q": {"theta_1": -1.2, "theta_3": -1.9}},
@@ -53,7 +53,7 @@ def run_seconds(scene: str, overrides: dict[str, Any] | None = None, times: int 
     return min_processor_time(lambda: run_prepared(prepared), times)
 
 
-def python_calls() -> float:
+def count_python_calls() -> float:
     """Count calls of Python within the step loop, over all shipped scenes in all formulations."""
     total = 0
     for name, _, scenes in list_catalogue():
@@ -64,7 +64,7 @@ def python_calls() -> float:
     return float(total)
 
 
-def inert_event() -> float:
+def measure_inert_event_ratio() -> float:
     """Return the time of the swing with an event that never triggers over the time without."""
     without_event, with_event = prepare_scene("five_bar/swing"), prepare_scene("five_bar/swing", {"event": INERT})
     pairs = [
@@ -110,7 +110,7 @@ def step_us(scene: str, overrides: dict[str, Any] | None = None) -> float:
     return 1e4 * min_processor_time(steps, 7)
 
 
-def circle() -> float:
+def measure_circle_ratio() -> float:
     """Return the time of `simulate` with a circle of the tip over that with a table of the same coordinates."""
     scene, start = "five_bar/tracking", {"formulation": "reduced", "initial": CIRCLE["initial"]}
     prepared = prepare_scene(scene, {**start, **CIRCLE})
@@ -152,14 +152,14 @@ def process_seconds(*words: str) -> float:
     return min(once() for _ in range(9))
 
 
-def command() -> float:
+def measure_command_ratio() -> float:
     """Return the time of `ckc run` over that of importing Pinocchio."""
     ckc = str(Path(sys.executable).parent / "ckc")
     run = process_seconds(ckc, "run", "five_bar/swing", "--json")
     return run / process_seconds(sys.executable, "-c", "import pinocchio")
 
 
-def lines() -> float:
+def count_lines() -> float:
     """Count the lines of the run loop's source in Python and C++."""
     files = [
         path
@@ -172,8 +172,8 @@ def lines() -> float:
 
 def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
     """Yield the lines of the table: what is measured, the function, its upper bound and the unit."""
-    yield "Python calls in the loop, all shipped scenes", python_calls, 0, ""
-    yield "swing with an inert event / without", inert_event, 1.15, ""
+    yield "Python calls in the loop, all shipped scenes", count_python_calls, 0, ""
+    yield "swing with an inert event / without", measure_inert_event_ratio, 1.15, ""
     yield "a caller's Python controller, a right-hand side", user_controller_us, 12, "us"
     yield (
         "tracking with sample_time = 1e-3, 9.5 s",
@@ -183,7 +183,7 @@ def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
     )
     for scene, bound in (("five_bar", 25), ("delta", 60), ("two_ur5", 150), ("talos", 2000)):
         yield f"Simulator.step of 1 ms, {scene}", partial(step_us, scene), bound, "us"
-    yield "a tip's circle tracked / the same by a table of coordinates, whole", circle, 3, ""
+    yield "a tip's circle tracked / the same by a table of coordinates, whole", measure_circle_ratio, 3, ""
     yield "talos/default", lambda: run_seconds("talos/default"), 0.8, "s"
     yield "flyball as DAE to 1e-6", lambda: run_seconds("flyball", {"solver.rtol": 1e-6}), 0.3, "s"
     yield "a run again, beyond the loop's own time", run_overhead_us, 50, "us"
@@ -193,8 +193,8 @@ def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
         3,
         "ms",
     )
-    yield "ckc run five_bar/swing --json / import pinocchio", command, 1.8, ""
-    yield "lines of ckc_pin/run and native", lines, LINES, ""
+    yield "ckc run five_bar/swing --json / import pinocchio", measure_command_ratio, 1.8, ""
+    yield "lines of ckc_pin/run and native", count_lines, MAX_LINES, ""
 
 
 def main(only: str = "") -> int:

@@ -12,7 +12,7 @@ __all__ = ["BLACK", "COLOURS", "chart", "save", "shrink", "whole_decades"]
 # Okabe and Ito's colours, which colour-blind readers can distinguish. Yellow is left out: its lines are hard to see.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 BLACK = "#000000"
-SEEN = 16  # of 255: largest difference of a colour from its palette
+MAX_COLOUR_ERROR = 16  # of 255: largest invisible difference of a colour from its palette
 
 
 def chart(columns: int = 1, rows: int = 1, size: tuple[float, float] = (6.4, 4.6)) -> tuple[Any, Any]:
@@ -61,6 +61,6 @@ def _write(image: Any, path: Path) -> None:
     from PIL import Image
 
     exact = image.convert("RGB")
-    few = exact.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE)
-    off = np.abs(np.asarray(few.convert("RGB"), dtype=int) - np.asarray(exact, dtype=int)).max()
-    (few if off <= SEEN else exact).save(path, optimize=True)
+    quantized = exact.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE)
+    error = np.abs(np.asarray(quantized.convert("RGB"), dtype=int) - np.asarray(exact, dtype=int)).max()
+    (quantized if error <= MAX_COLOUR_ERROR else exact).save(path, optimize=True)

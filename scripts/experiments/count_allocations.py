@@ -1,7 +1,7 @@
-"""Allocations of the step loop: none a step, so that a stretch of many steps makes as many as one of few.
+"""Check that steps of the loop allocate no memory: an interval of many steps makes as many allocations as one of few.
 
-How tracking control answers to the state, which an implicit method asks for now and then, is a page of matrices that
-are made anew each time, as many: those are counted by Jacobian.
+The state derivatives of a tracking controller do allocate matrices. Implicit methods evaluate them with each Jacobian,
+so the allowed number of allocations is multiplied by the number of Jacobians.
 """
 
 from ctypes import CDLL, c_long
@@ -23,7 +23,7 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("five_bar/swing", {"formulation": "spf", "initial.w": [0.01, -0.006], "epsilon": 1e-2}),
     ("five_bar/swing", {"formulation": "spf", "spf_coordinates": "z", "epsilon": 1e-2}),
     ("five_bar/swing", {"event": [EVENT, {"of": "sigma_min_J", "value": 1e-3}]}),
-    ("five_bar/tracking", {"solver.method": "DOP853"}),  # "auto" asks now and then whether it is stiff, and that does
+    ("five_bar/tracking", {"solver.method": "DOP853"}),  # "auto" allocates when it tests for stiffness
     ("five_bar/tracking", {"solver.method": "Radau"}),
     ("five_bar/tracking", {"controller.sample_time": 1e-3}),
     ("five_bar/swing", {"solver.terms": "generated"}),
@@ -35,7 +35,7 @@ SCENES: list[tuple[str, dict[str, Any]]] = [
     ("delta/default", {}),
     ("delta/circle", {}),
 ]
-VARIED: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
+SENSITIVITY_RUNS: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("five_bar/swing", {"formulation": "dae"}, ("gravity.y",)),
     ("five_bar/swing", {"formulation": "dae", "solver.terms": "generated"}, ("gravity.y", "link.link_2.mass")),
     ("five_bar/set_point", {"formulation": "dae", "solver.terms": "generated"}, ("gravity.y", "controller.K_P")),
@@ -43,10 +43,11 @@ VARIED: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
 
 
 def main(library: Path) -> int:
+    """Print the allocations of two intervals of each run; return 1 if steps allocate. `library` has the counter."""
     counter = CDLL(str(library)).allocations
     counter.restype = c_long
     bad = 0
-    for scene, overrides, parameters in [*((*x, ()) for x in SCENES), *VARIED]:
+    for scene, overrides, parameters in [*((*x, ()) for x in SCENES), *SENSITIVITY_RUNS]:
         ready = prepare(
             load_scene(scene, overrides), set_up_sensitivities=sensitivity_setup(parameters) if parameters else None
         )
@@ -56,17 +57,19 @@ def main(library: Path) -> int:
         ready.begin()
         loop.record(instants, rows)
 
-        def stretch(end: float, loop: Any = loop) -> tuple[int, int, int]:
-            stats, before = loop.stats(), counter()
+        def advance(end: float, loop: Any = loop) -> tuple[int, int, int]:
+            """Advance to a time; return the numbers of allocations, steps and Jacobians."""
+            before, allocations = loop.stats(), counter()
             loop.advance(end, final=False, pause=60.0, budget=60.0)
-            made = counter() - before
-            now = loop.stats()
-            return made, now.steps - stats.steps, now.jacobians - stats.jacobians
+            allocations = counter() - allocations
+            after = loop.stats()
+            return allocations, after.steps - before.steps, after.jacobians - before.jacobians
 
-        stretch(0.1)  # whatever grows has grown
-        few, short, once = stretch(0.12)
-        many, long, often = stretch(0.3)
-        print(f"{scene} {overrides or ''} {' '.join(parameters)}: {few} allocations in {short} steps, {many} in {long}")
-        jacobians = often / once if once and ready.scene.spec.controller else 1.0
-        bad += many > few * jacobians or long < 2 * short
+        advance(0.1)  # buffers reach their final size
+        few, few_steps, few_jacobians = advance(0.12)
+        many, many_steps, many_jacobians = advance(0.3)
+        name = f"{scene} {overrides or ''} {' '.join(parameters)}"
+        print(f"{name}: {few} allocations in {few_steps} steps, {many} in {many_steps}")
+        jacobians = many_jacobians / few_jacobians if few_jacobians and ready.scene.spec.controller else 1.0
+        bad += many > few * jacobians or many_steps < 2 * few_steps
     return 1 if bad else 0

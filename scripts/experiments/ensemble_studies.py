@@ -82,18 +82,18 @@ def basin(out: Path, count: int) -> str:
     inside = _proved(case, proved.safe_level, starts)
     map_ = ckc_pin.singularity_map("five_bar")
     q = case.mechanism.partition.q
-    curves = [_broken(locus.q_tree[:, q]) for locus in map_.loci if locus.kind != "serial"]
+    curves = [_wrap_angles(locus.q_tree[:, q]) for locus in map_.loci if locus.kind != "serial"]
     target = case.controller.q_d
     draw_basins(data_set, names, "end", out / "basin.png", settled="settled", curves=curves,
                 marks=[("$q_d$", float(target[0]), float(target[1]))])  # fmt: skip
     can = data_set["status"].to_numpy() != 3
     return "\n".join(
         [
-            f"starts {len(starts)}, of which the mechanism can have {can.sum()}; settle at q_d {home.sum()}",
-            f"stopped on the way {np.count_nonzero(data_set['status'].to_numpy() == 2)}",
+            f"{len(starts)} starts, {can.sum()} can be assembled, {home.sum()} settle at q_d, "
+            f"{np.count_nonzero(data_set['status'].to_numpy() == 2)} runs stop before the end",
             f"the scene's start: {proved.status} ({proved.reason}); proved up to V_L = {proved.safe_level:.3g} J of "
             f"{proved.level:.3g} J",
-            f"starts within what is proved {inside.sum()}, of which settle at q_d {np.count_nonzero(inside & home)}",
+            f"{inside.sum()} starts in the proved set, {np.count_nonzero(inside & home)} of them settle at q_d",
         ]
     )
 
@@ -111,7 +111,7 @@ def _proved(case: Any, level: float, starts: Array) -> BoolArray:
     return inside
 
 
-def _broken(curve: Array) -> Array:
+def _wrap_angles(curve: Array) -> Array:
     """Wrap a curve of angles to [-pi, pi), with a row of NaN at each jump."""
     turned = (curve + np.pi) % (2 * np.pi) - np.pi
     jumps = np.flatnonzero(np.abs(np.diff(turned, axis=0)).max(axis=1) > np.pi) + 1

@@ -8,6 +8,7 @@ processor times; times of right-hand sides are the minimum of many.
 from __future__ import annotations
 
 import os
+import resource
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -96,10 +97,10 @@ def measure(name: str) -> Size:
     with tempfile.TemporaryDirectory() as folder, empty_cache(Path(folder) / "cache"):
         scene = _scene(name, Path(folder))
         mechanism = load_scene_mechanism(load_scene(scene))
-        began = _spent()
+        began = _processor_seconds()
         functions = TermFunctions.of(mechanism)
         text = functions.c_source()
-        expressions_s, began = _spent() - began, _spent()
+        expressions_s, began = _processor_seconds() - began, _processor_seconds()
         reason, library = "", None
         try:
             library = compile_terms(mechanism, limited=False)
@@ -110,7 +111,7 @@ def measure(name: str) -> Size:
             functions.functions["acceleration"].n_instructions(),
             len(text),
             expressions_s,
-            _spent() - began,
+            _processor_seconds() - began,
         )
         if library is None:
             return Size(name, *about, reason=reason)
@@ -155,9 +156,10 @@ def _rhs_s(scene: str, library: Library | None) -> float:
     return min(float(ready.loop.seconds(states, ROUNDS)) for _ in range(REPEATS))
 
 
-def _spent() -> float:
+def _processor_seconds() -> float:
     """Return the processor time of this process and of its finished compilers, s."""
-    return sum(os.times()[:4])
+    usages = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-__all__ = ["DOCS", "GZIP", "digits", "environment", "render", "said", "versions"]
+__all__ = ["DOCS", "GZIP", "digits", "environment", "render", "render_blocks", "versions"]
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TEMPLATES = Path(__file__).parent / "templates"
@@ -24,7 +24,7 @@ def render(template: str, **content: Any) -> str:
     return environment().get_template(f"{template}.md.j2").render(content).lstrip("\n")
 
 
-def said(template: str, **values: Any) -> dict[str, Any]:
+def render_blocks(template: str, **values: Any) -> dict[str, Any]:
     """Return a template's filled-in blocks. Blank lines separate paragraphs; the lines of a paragraph are joined.
 
     Returns

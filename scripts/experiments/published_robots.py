@@ -17,7 +17,7 @@ from pathlib import Path
 import ckc_pin
 from ckc_pin.base.sources import resolve_path
 from ckc_pin.formats.importing import read, write
-from scripts.experiments.published_robots_motion import given_back
+from scripts.experiments.published_robots_motion import measure_reproduction_error
 
 PACKAGE = "package://example-robot-data/robots"
 
@@ -122,7 +122,7 @@ def row(name: str, path: Path) -> str:
             what = str(error).partition("mechanism.toml: ")[2].partition(". Check")[0]
             return _line(name, "yes", "no", motors, *[""] * 6, "; ".join([*remarks, what]))
     try:
-        back = f"{given_back(draft):.0e}"
+        back = f"{measure_reproduction_error(draft):.0e}"
     except ckc_pin.CkcError as error:
         print(f"{path}: {error}", file=sys.stderr)
         back = "none"

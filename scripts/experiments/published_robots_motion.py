@@ -16,12 +16,12 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.control.desired import Table
 from ckc_pin.formats.importing import Draft, write
 
-__all__ = ["given_back"]
+__all__ = ["measure_reproduction_error"]
 
 T_END = 0.005  # s; without feedback, rounding makes light rods under large forces diverge within milliseconds
-RATE = 1 / T_END  # rad/s: no coordinate reverses within T_END
-SIZE = 0.01  # rad, or of the mechanism's size
-AWAY = 0.3  # rad, or of the mechanism's size: from a singular configuration
+ANGULAR_FREQUENCY = 1 / T_END  # rad/s: no coordinate reverses within T_END
+AMPLITUDE = 0.01  # rad, or of the mechanism's size
+SINGULAR_OFFSET = 0.3  # rad, or of the mechanism's size: from a singular configuration
 STEPS = 100
 SCENE = f"""mechanism = "mechanism.toml"
 formulation = "dae"
@@ -41,11 +41,11 @@ class _Torques:
         return self.table(t)[0]
 
 
-def given_back(draft: Draft) -> float:
-    """Return how well the torques from inverse dynamics reproduce a motion.
+def measure_reproduction_error(draft: Draft) -> float:
+    """Return how far the torques from inverse dynamics miss the motion that they were computed from.
 
-    Every independent coordinate swings and has a motor. A free root has no motor; there, the motors push as they would
-    to swing alone. Joint ranges are not stops.
+    All independent coordinates oscillate and have motors. A free root has no motor; then the motors apply the torques
+    of an oscillation of each coordinate alone. Joint ranges are not stops.
 
     Returns
     -------
@@ -57,15 +57,18 @@ def given_back(draft: Draft) -> float:
     CkcError
         There is no such motion, or a run stops before its end.
     """
-    drawn = draft.build_mechanism()
-    numbers = drawn.tree.to_coordinates(drawn.q_tree) + AWAY * drawn.tree.step_scale * drawn.freedoms.singular
+    imported = draft.build_mechanism()
+    numbers = (
+        imported.tree.to_coordinates(imported.q_tree)
+        + SINGULAR_OFFSET * imported.tree.step_scale * imported.freedoms.singular
+    )
     draft = replace(
         draft,
         joints=[(msgspec.structs.replace(spec, stops=False), comment) for spec, comment in draft.joints],
-        independent=list(drawn.independent),
+        independent=list(imported.independent),
         actuated=None,
         motors=[],
-        q_guess=drawn.tree.named(numbers),
+        q_guess=imported.tree.named(numbers),
     )
     with TemporaryDirectory() as folder:
         write(draft, Path(folder))
@@ -88,11 +91,13 @@ def given_back(draft: Draft) -> float:
 def _swing(mechanism: Mechanism) -> dict[str, Any]:
     """Return overrides of the scene: the desired motion and the start of the independent coordinates."""
     tree, names = mechanism.tree, mechanism.independent
-    offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(SIZE * tree.step_scale)
-    desired = {name: {"offset": offset[name], "harmonics": [[amplitude[name], RATE, 0.0]]} for name in names}
+    offset, amplitude = tree.named(tree.to_coordinates(mechanism.q_tree)), tree.named(AMPLITUDE * tree.step_scale)
+    desired = {
+        name: {"offset": offset[name], "harmonics": [[amplitude[name], ANGULAR_FREQUENCY, 0.0]]} for name in names
+    }
     return {
         "controller": {"type": "tracking", "Lambda": 1.0, "K_D": 1.0, "desired": desired},
-        "initial": {"at": "assembled", "q_dot": {name: RATE * amplitude[name] for name in names}},
+        "initial": {"at": "assembled", "q_dot": {name: ANGULAR_FREQUENCY * amplitude[name] for name in names}},
     }
 
 
@@ -101,6 +106,6 @@ def _push(mechanism: Mechanism) -> _Torques:
     at = mechanism.assembled
     inertia = at.rho.T @ Terms(mechanism, at, np.zeros(mechanism.n)).D_tree @ at.rho
     moved = mechanism.motors.transmission @ at.rho
-    force = SIZE * RATE**2 / np.diag(moved @ np.linalg.solve(inertia, moved.T))
+    force = AMPLITUDE * ANGULAR_FREQUENCY**2 / np.diag(moved @ np.linalg.solve(inertia, moved.T))
     t = np.linspace(0.0, T_END, STEPS + 1)
-    return _Torques(Table(t, np.outer(np.cos(RATE * t), force)))
+    return _Torques(Table(t, np.outer(np.cos(ANGULAR_FREQUENCY * t), force)))

@@ -12,12 +12,12 @@ from ckc_pin.analysis.precision.motion import FORMULATIONS
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.scene.scene import list_catalogue
 
-TIGHT = 1e-11
-ALLOWED = 100  # largest error of a run over the tolerance of a step
+REFERENCE_RTOL = 1e-11
+MAX_ERROR = 100  # largest error of a run over its tolerance
 # s: NumPy takes a millisecond per right-hand side, and chaotic motions amplify errors later.
 SPANS = {"andrews": 0.01, "delta": 0.1, "stewart": 0.05, "talos": 0.01, "two_ur5": 0.1}
 SPAN = 0.3
-SMOOTH = 0.1  # rad/s: sticking joints are not a function of t and y
+FRICTION_SMOOTHING = 0.1  # rad/s; without it the right-hand side of sticking joints is not a function of t and y
 
 
 def relative_error(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
@@ -28,7 +28,13 @@ def relative_error(scene: str, overrides: dict[str, Any]) -> tuple[float, str]:
     # Scenes of eq. 8 are stiff in z only, with the rate 1 / epsilon.
     method = "Radau" if overrides.get("spf_coordinates") == "z" or scene.startswith("flyball") else "DOP853"
     solution = solve_ivp(
-        problem.f, (0.0, run.t[-1]), problem.y0, method, t_eval=run.t[rows], rtol=TIGHT, atol=TIGHT / 100
+        problem.f,
+        (0.0, run.t[-1]),
+        problem.y0,
+        method,
+        t_eval=run.t[rows],
+        rtol=REFERENCE_RTOL,
+        atol=REFERENCE_RTOL / 100,
     )
     assert solution.success, solution.message
     error = 0.0
@@ -47,7 +53,7 @@ def main() -> int:
         for name, _, scenes in list_catalogue():
             for scene in scenes:
                 cells = []
-                smooth = {"friction_smoothing": SMOOTH} if load(name).joints.friction.any() else {}
+                smooth = {"friction_smoothing": FRICTION_SMOOTHING} if load(name).joints.friction.any() else {}
                 for overrides in FORMULATIONS.values():
                     span = SPANS.get(name, SPAN)
                     try:
@@ -57,7 +63,7 @@ def main() -> int:
                     except InputError:
                         cells.append("refused")
                         continue
-                    bad += not error <= ALLOWED
+                    bad += not error <= MAX_ERROR
                     cells.append(f"{error:.2g} {method}")
                 print(f"| {name}/{scene} | " + " | ".join(cells) + " |", flush=True)
     return 1 if bad else 0

@@ -22,7 +22,7 @@ PARTS = {
     "stability": (["length"], "| length | 21 | 21 | 0 | 0 |"),
     "rank_loss": (["--quick", "--formulation", "dae"], "0 wrong"),
     "generated_sizes": (["1"], "| 1 | 3 |"),
-    "ensembles": (["--quick"], "starts within what is proved"),
+    "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }

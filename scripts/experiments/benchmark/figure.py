@@ -49,7 +49,9 @@ def draw(analysis: Analysis, work: str, folder: Path) -> str:
     _panel(axes[2], programs, "wall_s", "energy_drift", "programs: energy")
     if analysis.works.controlled[work] or not axes[2].lines:
         axes[2].set_axis_off()
-        axes[2].text(0.5, 0.5, "energy is not kept here: something acts", ha="center", transform=axes[2].transAxes)
+        axes[2].text(
+            0.5, 0.5, "energy is not conserved: a controller or damper", ha="center", transform=axes[2].transAxes
+        )
     _panel(axes[3], formulations, "wall_s", "error_max", f"{PROGRAM}: error")
     _panel(axes[4], formulations, "rhs", "error_max", f"{PROGRAM}: error")
     _panel(axes[5], formulations, "wall_s", "error_end", f"{PROGRAM}: at the end")

@@ -80,8 +80,8 @@ class Family:
 
 
 def _family(key: str, says: str, along: str, cases: Sequence[tuple[int, int]], quick: int) -> Family:
-    made = tuple(Case(N, loops) for N, loops in cases)
-    return Family(key, says, along, made, made[:quick])
+    members = tuple(Case(N, loops) for N, loops in cases)
+    return Family(key, says, along, members, members[:quick])
 
 
 WIDE = 20

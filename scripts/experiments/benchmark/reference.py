@@ -50,10 +50,10 @@ def reference(work: Work) -> Reference:
         return _row_of_squares(work)
     formulations = ("dae", "reduced")
     first, second = (_tight(work, formulation) for formulation in formulations)
-    apart = float(np.abs(first - second).max())
+    difference = float(np.abs(first - second).max())
     published_error, where = _published(work, first)
-    how = f"DAE at {TIGHT:.0e}; the reduced model at {TIGHT:.0e} agrees to {apart:.1e}{where}"
-    return Reference(first, max(apart, published_error), how)
+    how = f"DAE at {TIGHT:.0e}; the reduced model at {TIGHT:.0e} agrees to {difference:.1e}{where}"
+    return Reference(first, max(difference, published_error), how)
 
 
 def _tight(work: Work, formulation: str) -> Array:

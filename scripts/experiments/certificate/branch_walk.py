@@ -66,7 +66,7 @@ def wrapped_difference(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Ar
 
 
 def same_configuration(mechanism: Mechanism, a: Kinematics, b: Kinematics, tolerance: float = 1e-6) -> bool:
-    """Whether two configurations differ by full turns only."""
+    """Return whether two configurations differ by full turns only."""
     return bool(np.abs(_without_turns(mechanism, a, b)).max(initial=0.0) < tolerance)
 
 
@@ -79,23 +79,23 @@ def _without_turns(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> Array:
 
 @dataclass(frozen=True)
 class Border:
-    """Border |s| = s_min: accepts configurations on one side, and moves those on the other side onto it.
+    """Border |s| = s_min. It accepts configurations on one side, and projects configurations of the other side onto it.
 
     Attributes
     ----------
     mechanism : Mechanism
     s_min : float
-    near : bool
-        Whether the side of the singular configuration is accepted.
+    accepts_singular_side : bool
+        Whether configurations with |s| <= s_min are accepted, or with |s| >= s_min.
     """
 
     mechanism: Mechanism
     s_min: float
-    near: bool = False
+    accepts_singular_side: bool = False
 
     def __call__(self, at: Kinematics) -> Kinematics | None:
         """Return the configuration, or one on the border, or None if the border cannot be reached."""
-        sign = -1.0 if self.near else 1.0
+        sign = -1.0 if self.accepts_singular_side else 1.0
         for _ in range(MAX_CORRECTIONS):
             gap = self.s_min - margin(at)
             if sign * gap <= MARGIN_TOLERANCE * self.s_min:
@@ -103,7 +103,7 @@ class Border:
             slope = margin_gradient(at)
             at, reached = follow(self.mechanism, at, (gap + sign * 1e-10 * self.s_min) * slope / (slope @ slope))
             if reached < 1.0:
-                return at if self.near else None
+                return at if self.accepts_singular_side else None
         return None
 
 

@@ -55,7 +55,7 @@ class Certificate:
         Of K_P + sym dh/dq on the set, N m/rad between angles; NaN where the set reaches a singular
         configuration, at which h has no derivative.
     smallest_margin : float
-        Least |s| on the set, see `scripts.experiments.certificate.branch_walk.margin`.
+        Smallest |s| on the set, see `scripts.experiments.certificate.branch_walk.margin`.
     safe_level : float
         Largest level, J, at which the set around q_d satisfies the conditions, by the lattice; at most `level`.
     worst_q : (d,) array
@@ -87,7 +87,7 @@ class SublevelSet:
     ----------
     explored : Explored
     eigenvalues, margins : (points,) arrays
-        Least eigenvalue of K_P + sym dh/dq, and |s|, at the nodes explored.
+        Smallest eigenvalue of K_P + sym dh/dq, and |s|, at the nodes explored.
     step : (d,) array
     """
 
@@ -150,24 +150,24 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
         See `sublevel_set`.
     """
     level = level_of(mechanism, controller, start)
-    unfit = _unfit(mechanism, controller, start, level)
-    if unfit:
-        nowhere = np.full(mechanism.d, np.nan)
-        return Certificate("not certified", unfit, level, np.nan, np.nan, 0.0, nowhere, mechanism.d > 2, 0, nowhere)
+    reason = _find_obstacle(mechanism, controller, start, level)
+    if reason:
+        nan = np.full(mechanism.d, np.nan)
+        return Certificate("not certified", reason, level, np.nan, np.nan, 0.0, nan, mechanism.d > 2, 0, nan)
     sublevel = sublevel_set(mechanism, controller, level, divisions)
     search = _Search(mechanism, controller, sublevel, level)
-    tight, soft = search.tightest(), search.softest()
-    singular = bool(sublevel.explored.ends) or margin(tight) <= SINGULAR_MARGIN
-    failure = search.first_failure([tight, soft])
-    safe_level, worst = failure or (level, soft)
+    tightest, softest = search.find_smallest_margin(), search.find_smallest_stiffness()
+    singular = bool(sublevel.explored.ends) or margin(tightest) <= SINGULAR_MARGIN
+    failure = search.find_first_failure([tightest, softest])
+    safe_level, worst = failure or (level, softest)
     return Certificate(
         status="certified"
-        if failure is None and not sublevel.explored.full and search.connected(start)
+        if failure is None and not sublevel.explored.truncated and search.is_connected(start)
         else "not certified",
-        reason=search.reason(singular, tight, soft, start),
+        reason=search.explain(singular, tightest, softest, start),
         level=level,
-        smallest_eigenvalue=np.nan if singular else search.stiffness(soft),
-        smallest_margin=0.0 if singular else margin(tight),
+        smallest_eigenvalue=np.nan if singular else search.stiffness(softest),
+        smallest_margin=0.0 if singular else margin(tightest),
         safe_level=safe_level,
         worst_q=mechanism.independent_part(worst.q_tree),
         sampled=sublevel.explored.sampled,
@@ -176,7 +176,7 @@ def certify(mechanism: Mechanism, controller: SetPoint, start: Start, divisions:
     )
 
 
-def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: float) -> str:
+def _find_obstacle(mechanism: Mechanism, controller: SetPoint, start: Start, level: float) -> str:
     """Return why the argument does not apply at all; empty if it may apply."""
     if controller.target.mechanism is not mechanism:
         return "the controller compensates the gravity of another model than the plant"
@@ -191,7 +191,7 @@ def _unfit(mechanism: Mechanism, controller: SetPoint, start: Start, level: floa
 
 @dataclass(frozen=True)
 class _Search:
-    """Search between the points of the lattice."""
+    """Search for smallest values and failures between the points of the lattice."""
 
     mechanism: Mechanism
     controller: SetPoint
@@ -204,20 +204,21 @@ class _Search:
     def stiffness(self, at: Kinematics) -> float:
         return _stiffness(self.mechanism, self.controller, at)
 
-    def fails(self, at: Kinematics) -> bool:
+    def is_failure(self, at: Kinematics) -> bool:
+        """Return whether a configuration is singular, or K_P + dh/dq is not positive definite there."""
         return margin(at) <= SINGULAR_MARGIN or self.stiffness(at) <= 0
 
-    def tightest(self) -> Kinematics:
+    def find_smallest_margin(self) -> Kinematics:
         if self.sublevel.explored.ends:
             return min(self.sublevel.explored.ends, key=lambda end: end.water).at
         return self._lowest(margin, self.sublevel.margins)
 
-    def softest(self) -> Kinematics:
+    def find_smallest_stiffness(self) -> Kinematics:
         if self.sublevel.explored.ends:
             return self.sublevel.explored.nodes[int(np.argmin(self.sublevel.eigenvalues))]
         return self._lowest(self.stiffness, self.sublevel.eigenvalues)
 
-    def first_failure(self, refined: list[Kinematics]) -> tuple[float, Kinematics] | None:
+    def find_first_failure(self, refined: list[Kinematics]) -> tuple[float, Kinematics] | None:
         """Return the largest level without a failure and the first failure; None if nothing fails."""
         explored = self.sublevel.explored
         failing = [
@@ -225,64 +226,68 @@ class _Search:
             for w, at, x in zip(explored.water, explored.nodes, self.sublevel.eigenvalues, strict=True)
             if x <= 0
         ]
-        failing += [(max(0.0, self.height(at)), at) for at in refined if self.fails(at)]
+        failing += [(max(0.0, self.height(at)), at) for at in refined if self.is_failure(at)]
         failing += [(end.water, end.at) for end in explored.ends]
         if not failing:
             return None
         water, first = min(failing, key=lambda pair: pair[0])
         below = max((w for w in explored.water if w < water), default=0.0)
-        near = Border(self.mechanism, BORDER_MARGIN, near=True) if margin(first) <= SINGULAR_MARGIN else self._failing
-        lowest = find_minimum(self.mechanism, first, self.height, self.sublevel.step, near)
+        is_singular = margin(first) <= SINGULAR_MARGIN
+        border = Border(self.mechanism, BORDER_MARGIN, accepts_singular_side=True)
+        admit = border if is_singular else self._failing
+        lowest = find_minimum(self.mechanism, first, self.height, self.sublevel.step, admit)
         return min(below, max(0.0, self.height(lowest))), lowest if 0.0 <= self.height(lowest) < water else first
 
-    def reason(self, singular: bool, tight: Kinematics, soft: Kinematics, start: Start) -> str:
+    def explain(self, singular: bool, tightest: Kinematics, softest: Kinematics, start: Start) -> str:
+        """Return the sentence of `Certificate.reason`."""
         if singular:
-            return f"the set reaches a singular configuration, near {self._where(tight)}"
-        if self.stiffness(soft) <= 0:
-            return f"K_P + dh/dq has the eigenvalue {self.stiffness(soft):.3g} at {self._where(soft)}, inside the set"
-        if self.sublevel.explored.full:
+            return f"the set reaches a singular configuration, near {self._format_q(tightest)}"
+        stiffness = self.stiffness(softest)
+        if stiffness <= 0:
+            return f"K_P + dh/dq has the eigenvalue {stiffness:.3g} at {self._format_q(softest)}, inside the set"
+        if self.sublevel.explored.truncated:
             return f"the set extends beyond the {len(self.sublevel.explored.nodes)} points that were explored"
-        if not self.connected(start):
+        if not self.is_connected(start):
             return "the start is not connected to q_d within {V_L(q, 0) <= V_L(start)}"
         return "K_P + dh/dq is positive definite on the whole set, and no singular configuration lies on it"
 
-    def connected(self, start: Start) -> bool:
-        """Whether the start is next to a node of the lattice, or visible from q_d, on the same branch."""
+    def is_connected(self, start: Start) -> bool:
+        """Return whether the start is next to a node of the lattice, or visible from q_d, on the same branch."""
         if self.sublevel.explored.sampled:
             return self._is_visible(start.at)
         q = self.mechanism.independent_part(start.at.q_tree)
         for at in self.sublevel.explored.nodes:
             straight = q - self.mechanism.independent_part(at.q_tree)
-            if np.all(np.abs(straight) <= 1.01 * self.sublevel.step) and self._leads(at, straight, start.at):
+            if np.all(np.abs(straight) <= 1.01 * self.sublevel.step) and self._is_reached(at, straight, start.at):
                 return True
         return False
 
-    def _is_visible(self, there: Kinematics) -> bool:
-        """Whether the straight line from q_d stays inside the set."""
+    def _is_visible(self, end: Kinematics) -> bool:
+        """Return whether the straight line from q_d to a configuration stays inside the set."""
         at = self.controller.target.at
-        straight = self.mechanism.independent_part(there.q_tree) - self.controller.q_d
+        straight = self.mechanism.independent_part(end.q_tree) - self.controller.q_d
         pieces = 1 + int(np.ceil(np.max(np.abs(straight) / self.sublevel.step)))
         for _ in range(pieces - 1):
             at, reached = follow(self.mechanism, at, straight / pieces)
             if reached < 1.0 or self.height(at) > self.level:
                 return False
-        return self._leads(at, straight / pieces, there)
+        return self._is_reached(at, straight / pieces, end)
 
-    def _leads(self, at: Kinematics, straight: Array, there: Kinematics) -> bool:
-        end, reached = follow(self.mechanism, at, straight)
-        return reached == 1.0 and same_configuration(self.mechanism, end, there)
+    def _is_reached(self, at: Kinematics, straight: Array, end: Kinematics) -> bool:
+        reached, fraction = follow(self.mechanism, at, straight)
+        return fraction == 1.0 and same_configuration(self.mechanism, reached, end)
 
     def _lowest(self, value: Callable[[Kinematics], float], values: Array) -> Kinematics:
         nodes, step = self.sublevel.explored.nodes, self.sublevel.step
         return find_minimum(self.mechanism, nodes[int(np.argmin(values))], value, step, self._inside)
 
     def _failing(self, at: Kinematics) -> Kinematics | None:
-        return at if self.fails(at) else None
+        return at if self.is_failure(at) else None
 
     def _inside(self, at: Kinematics) -> Kinematics | None:
         return at if self.height(at) <= self.level else None
 
-    def _where(self, at: Kinematics) -> str:
+    def _format_q(self, at: Kinematics) -> str:
         q = self.mechanism.independent_part(at.q_tree)
         return ", ".join(f"{name} = {x:.4g}" for name, x in zip(self.mechanism.independent, q, strict=True))
 

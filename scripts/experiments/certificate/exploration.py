@@ -48,7 +48,7 @@ class Explored:
         Ends of the branch inside the explored part.
     sampled : bool
         Whether rays were followed instead of a lattice.
-    full : bool
+    truncated : bool
         Whether the exploration ended at MAX_POINTS.
     """
 
@@ -57,7 +57,7 @@ class Explored:
     edges: list[tuple[int, int]] = field(default_factory=list)
     ends: list[End] = field(default_factory=list)
     sampled: bool = False
-    full: bool = False
+    truncated: bool = False
 
 
 def explore(
@@ -104,39 +104,40 @@ def _flood(
 ) -> Explored:
     explored = Explored()
     origin = (0,) * mechanism.d
-    number: dict[tuple[int, ...], int] = {}
-    waiting: list[tuple[float, int, tuple[int, ...], Kinematics]] = []
+    node_of: dict[tuple[int, ...], int] = {}
+    queue: list[tuple[float, int, tuple[int, ...], Kinematics]] = []
     seen, order = {origin}, 0
     if height(centre) <= level:
-        waiting.append((height(centre), order, origin, centre))
-    while waiting:
-        water, _, place, at = heapq.heappop(waiting)
-        number[place] = len(explored.nodes)
+        queue.append((height(centre), order, origin, centre))
+    while queue:
+        water, _, place, at = heapq.heappop(queue)
+        node_of[place] = len(explored.nodes)
         explored.nodes.append(at)
         explored.water.append(water)
         if len(explored.nodes) >= MAX_POINTS:
-            explored.full = True
+            explored.truncated = True
             break
         for k in range(mechanism.d):
             for sign in (-1, 1):
-                along = place[k] + sign
-                beside = (*place[:k], along % turn[k] if turn is not None and turn[k] else along, *place[k + 1 :])
-                if beside in number:
-                    explored.edges.append((number[beside], number[place]))
-                if beside in seen:
+                index = place[k] + sign
+                index = index % turn[k] if turn is not None and turn[k] else index
+                neighbour = (*place[:k], index, *place[k + 1 :])
+                if neighbour in node_of:
+                    explored.edges.append((node_of[neighbour], node_of[place]))
+                if neighbour in seen:
                     continue
                 dq = np.zeros(mechanism.d)
                 dq[k] = sign * step[k]
-                there, reached = follow(mechanism, at, dq)
-                rises = max(water, height(there))
-                if rises > level:
+                end, reached = follow(mechanism, at, dq)
+                end_water = max(water, height(end))
+                if end_water > level:
                     continue
                 if reached < 1.0:
-                    explored.ends.append(End(rises, number[place], there))
+                    explored.ends.append(End(end_water, node_of[place], end))
                     continue
-                seen.add(beside)
+                seen.add(neighbour)
                 order += 1
-                heapq.heappush(waiting, (rises, order, beside, there))
+                heapq.heappush(queue, (end_water, order, neighbour, end))
     return explored
 
 
@@ -163,5 +164,5 @@ def _cast(mechanism: Mechanism, centre: Kinematics, step: Array, height: Height,
             last = len(explored.nodes)
             explored.nodes.append(at)
             explored.water.append(water)
-    explored.full = len(explored.nodes) >= MAX_POINTS
+    explored.truncated = len(explored.nodes) >= MAX_POINTS
     return explored

@@ -21,7 +21,7 @@ from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED, elbow_distance, links
 
@@ -156,7 +156,7 @@ def claims(figures: Path) -> list[Claim]:
             ),
             figures=(_draw(figures, approaches, runs),),
             table=(("along eq. 21", *approaches), _rows(approaches, runs)),
-            **said(
+            **render_blocks(
                 "claims/no-singularities",
                 t=run.t[-1],
                 status=run.status,

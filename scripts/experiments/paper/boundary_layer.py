@@ -20,7 +20,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, five_bar_problem, on_level, sample, vector
 
@@ -213,7 +213,7 @@ def _layer_claim(layer: Layer, figures: Path) -> Claim:
         key="boundary-layer",
         verdict="holds" if abs(orders[-1] - 1) <= 0.05 and layer.factor < 2 else "does not hold",
         figures=(name,),
-        **said("claims/boundary-layer", layer=layer, order=orders[-1]),
+        **render_blocks("claims/boundary-layer", layer=layer, order=orders[-1]),
     )
 
 
@@ -236,7 +236,7 @@ def _eigenvalue_claim(problem: Problem, figures: Path) -> Claim:
         key="eq-13",
         verdict="holds with a condition" if stable and miss < 1e-9 else "does not hold",
         figures=(name,),
-        **said(
+        **render_blocks(
             "claims/eq-13",
             scene=SCENE,
             miss=miss,

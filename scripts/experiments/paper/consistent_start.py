@@ -14,7 +14,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import Problem, difference, end_of, five_bar_problem
 
@@ -85,7 +85,7 @@ def claims(figures: Path) -> list[Claim]:
             verdict="does not hold" if same and worst < 10 else "holds",
             figures=(name,),
             table=_table(studies),
-            **said(
+            **render_blocks(
                 "claims/epsilon-irrelevant",
                 t_end=T_END,
                 largest=[each.printed.max() for each in studies],

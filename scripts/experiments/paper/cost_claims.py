@@ -8,7 +8,7 @@ from typing import Any
 
 from ckc_pin.scene.scene import load_scene
 from scripts.experiments.chart import COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.cost import EPSILONS, METHODS, Cost, Search, cheapest, study
 from scripts.experiments.paper.experiment import Problem
@@ -59,7 +59,7 @@ def _text(by_scene: Costs) -> dict[str, Any]:
     with_sigma, without = (1e6 * c.seconds / c.count("rhs") for c in (reduced, printed))
     stiffest = min((c for c in explicit if c.epsilon and not c.reason), key=lambda c: c.epsilon or 0.0)
     asked = (("reduced", None), *(("eq. 8", epsilon) for epsilon in PAPER), ("DAE", None))
-    return said(
+    return render_blocks(
         "claims/cost",
         method=METHODS[0],
         corrections=reduced.count("newton") / reduced.count("rhs"),

@@ -14,7 +14,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics, Psi
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.ivp import PrintedSpf
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import march
 from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED
@@ -145,7 +145,7 @@ def _psi_claim(checks: dict[str, PsiCheck]) -> Claim:
              "|Psi| there"),
             rows,
         ),
-        **said("claims/implicit-function"),
+        **render_blocks("claims/implicit-function"),
     )  # fmt: skip
 
 
@@ -157,7 +157,7 @@ def _domain_claim() -> Claim:
     return Claim(
         key="spf-domain",
         verdict="holds with a condition" if larger and stopped else "holds" if larger else "does not hold",
-        **said(
+        **render_blocks(
             "claims/spf-domain",
             starts=len(beyond.arrived),
             sigma_min=beyond.sigma_min.min(),

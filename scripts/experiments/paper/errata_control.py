@@ -16,7 +16,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.run.ivp import LevelSet
 from ckc_pin.scene.parts import build_scene_controller
 from ckc_pin.scene.scene import load_scene
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, march
 from scripts.experiments.paper.five_bar import FIVE_BAR
@@ -52,7 +52,7 @@ def set_point_error() -> Erratum:
         difference=abs(wrong),
         agreement=abs(right),
         unit="W",
-        **said("errata/set-point-error"),
+        **render_blocks("errata/set-point-error"),
     )
 
 
@@ -66,7 +66,7 @@ def candidate_offset() -> Erratum:
         difference=abs(float(offset)),
         agreement=abs(at_target),
         unit="J",
-        **said("errata/candidate-offset"),
+        **render_blocks("errata/candidate-offset"),
     )
 
 
@@ -87,7 +87,7 @@ def equilibrium_sign() -> Erratum:
         difference=float(np.abs(h_d - h - K_P @ (q_d - q)).max()),
         agreement=float(np.abs(h - h_d - K_P @ (q_d - q)).max()),
         unit="N m",
-        **said("errata/equilibrium-sign", gain=WEAK, q=q),
+        **render_blocks("errata/equilibrium-sign", gain=WEAK, q=q),
     )
 
 
@@ -101,7 +101,7 @@ def gain_condition() -> Erratum:
         difference=-smallest,
         agreement=max(0.0, -diagonal),
         unit="N m/rad",
-        **said("errata/gain-condition", Lambda=Lambda.tolist()),
+        **render_blocks("errata/gain-condition", Lambda=Lambda.tolist()),
     )
 
 
@@ -123,7 +123,7 @@ def lyapunov_rate() -> Erratum:
         difference=float(min(abs(first - truth), abs(last - truth))),
         agreement=float(abs(right - truth)),
         unit="W",
-        **said("errata/lyapunov-rate", t=T, truth=truth, first=first, last=last),
+        **render_blocks("errata/lyapunov-rate", t=T, truth=truth, first=first, last=last),
     )
 
 
@@ -139,7 +139,7 @@ def rate_on_trajectory() -> Erratum:
         difference=abs(float(q_d_dot @ controller.K_D @ q_d_dot) + measured),
         agreement=abs(measured),
         unit="W",
-        **said("errata/rate-on-trajectory", t=T),
+        **render_blocks("errata/rate-on-trajectory", t=T),
     )
 
 

@@ -12,7 +12,7 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.scene import load_scene
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.along_eq21 import tracking, widest
 from scripts.experiments.paper.domain import check_psi
 from scripts.experiments.paper.erratum import Erratum
@@ -46,7 +46,7 @@ def multipliers() -> Erratum:
         difference=float(np.abs(mechanism.kinematics(apart).phi).max()),
         agreement=float(np.abs(together.phi[-1]).max()),
         unit="m",
-        **said("errata/multipliers", fall=FALL),
+        **render_blocks("errata/multipliers", fall=FALL),
     )
 
 
@@ -58,7 +58,7 @@ def psi_determinant() -> Erratum:
         difference=check.norm,
         agreement=check.singular,
         unit="m (|Psi_{q'}|), m² (det)",
-        **said("errata/psi-determinant"),
+        **render_blocks("errata/psi-determinant"),
     )
 
 
@@ -72,7 +72,7 @@ def coriolis_power() -> Erratum:
         difference=printed,
         agreement=first,
         unit="relative",
-        **said("errata/coriolis-power", states=STATES),
+        **render_blocks("errata/coriolis-power", states=STATES),
     )
 
 
@@ -85,7 +85,7 @@ def coriolis_skew() -> Erratum:
         difference=printed,
         agreement=christoffel,
         unit="kg m²/s",
-        **said("errata/coriolis-skew", states=STATES),
+        **render_blocks("errata/coriolis-skew", states=STATES),
     )
 
 
@@ -98,7 +98,7 @@ def closure_angles() -> Erratum:
         agreement=float(np.abs(at.phi).max()),
         unit="m",
         commands=("ckc check five_bar",),
-        **said("errata/closure-angles"),
+        **render_blocks("errata/closure-angles"),
     )
 
 
@@ -111,7 +111,7 @@ def table_rows() -> Erratum:
         agreement=max(0.0, loop - loop_reach),
         unit="m",
         commands=("ckc check five_bar_as_printed/tracking",),
-        **said("errata/table-rows", printed=(printed, reach), loop=(loop, loop_reach)),
+        **render_blocks("errata/table-rows", printed=(printed, reach), loop=(loop, loop_reach)),
     )
 
 
@@ -125,7 +125,7 @@ def type_1_points() -> Erratum:
         difference=float(np.linalg.norm(upper[0] - lower[0])),
         agreement=max(float(np.abs(points - points[0]).max()) for points in (upper, lower, np.vstack([upper, -lower]))),
         unit="rad",
-        **said("errata/type-1-points", q=upper[0], solutions=len(q)),
+        **render_blocks("errata/type-1-points", q=upper[0], solutions=len(q)),
     )
 
 
@@ -139,7 +139,7 @@ def lost_freedoms() -> Erratum:
         agreement=max(point.sigma_min_phi_z for point in points),
         unit="m",
         commands=("./scripts/experiment paper singular-freedoms",),
-        **said("errata/lost-freedoms", points=len(points)),
+        **render_blocks("errata/lost-freedoms", points=len(points)),
     )
 
 

@@ -11,7 +11,7 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.scene import load_scene
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.erratum import Erratum
 from scripts.experiments.paper.experiment import Problem, on_level
 from scripts.experiments.paper.five_bar import FIVE_BAR
@@ -44,7 +44,7 @@ def fast_error() -> Erratum:
         difference=float(np.abs(g - slow - truth).max()),
         agreement=float(np.abs(g - EPSILON * slow - truth).max()),
         unit="rad",
-        **said("errata/fast-error", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
+        **render_blocks("errata/fast-error", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
     )
 
 
@@ -61,7 +61,7 @@ def boundary_layer_sign() -> Erratum:
         difference=float(printed.max()),
         agreement=float(np.abs(printed - 1.0).max()),
         unit="1 (per unit of fast time)",
-        **said("errata/boundary-layer-sign"),
+        **render_blocks("errata/boundary-layer-sign"),
     )
 
 
@@ -81,7 +81,7 @@ def coriolis_arguments() -> Erratum:
         agreement=relative_error(on, np.zeros(2)),
         unit="kg m²/s",
         commands=("./scripts/experiment paper tikhonov-velocity",),
-        **said("errata/coriolis-arguments", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
+        **render_blocks("errata/coriolis-arguments", w=W.tolist(), q_dot=Q_DOT.tolist(), epsilon=EPSILON),
     )
 
 
@@ -94,7 +94,7 @@ def gravity_arguments() -> Erratum:
         difference=float(np.abs(h_of_q - exact).max()),
         agreement=float(np.abs(h - exact).max()),
         unit="N m",
-        **said("errata/gravity-arguments", w=W.tolist()),
+        **render_blocks("errata/gravity-arguments", w=W.tolist()),
     )
 
 

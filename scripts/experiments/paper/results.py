@@ -23,7 +23,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.ivp import LevelSet, make_force
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.along_eq21 import tracking
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import march
@@ -156,7 +156,7 @@ def _appendix() -> Claim:
         verdict="holds with a condition" if good else "does not hold",
         commands=('ckc terms five_bar --q \'{"theta_1": -1.2, "theta_3": -1.9}\' --v \'{"theta_1": 0.4}\'',),
         table=(("mechanism", "rows of links 1 to 4", "D' (eq. 24)", "C' v' (eq. 25)", "h' (eq. 26)"), tuple(rows)),
-        **said("claims/appendix", states=STATES),
+        **render_blocks("claims/appendix", states=STATES),
     )
 
 
@@ -168,7 +168,7 @@ def _equilibrium(run: Run) -> Claim:
     return Claim(
         key="initial-equilibrium",
         verdict="holds" if h < 1e-10 and stiffness[0] > 0 else "does not hold",
-        **said("claims/initial-equilibrium", angles=at.q_tree, h=h, stiffness=tuple(stiffness)),
+        **render_blocks("claims/initial-equilibrium", angles=at.q_tree, h=h, stiffness=tuple(stiffness)),
     )
 
 
@@ -182,7 +182,7 @@ def _figure_3(runs: list[Run], drawn: list[str]) -> Claim:
         verdict="holds" if q < 1e-6 and error < 1e-6 else "does not hold",
         commands=("./scripts/demo",),
         figures=tuple(name for name in drawn if name == "set_point.png"),
-        **said("claims/figure-3", epsilon=spf.scene["epsilon"], q=q, u=u, t_end=spf.t[-1], error=error),
+        **render_blocks("claims/figure-3", epsilon=spf.scene["epsilon"], q=q, u=u, t_end=spf.t[-1], error=error),
     )
 
 
@@ -193,7 +193,7 @@ def _figure_4(runs: list[Run], drawn: list[str]) -> Claim:
         verdict="holds" if q < 1e-6 and all(run.status == "done" for run in runs) else "does not hold",
         commands=("./scripts/demo",),
         figures=tuple(name for name in drawn if name == "tracking.png"),
-        **said("claims/figure-4", epsilon=runs[1].scene["epsilon"], q=q, u=u),
+        **render_blocks("claims/figure-4", epsilon=runs[1].scene["epsilon"], q=q, u=u),
     )
 
 
@@ -215,7 +215,7 @@ def _torques(cases: dict[str, list[Run]]) -> Claim:
             ("case", "formulation", "largest |u| (N m)", "at t (s)", f"largest from {STEADY:g} s on (N m)"),
             tuple(rows),
         ),
-        **said("claims/torques", first=FIRST, later=LATER),
+        **render_blocks("claims/torques", first=FIRST, later=LATER),
     )
 
 
@@ -238,7 +238,9 @@ def _law(laws: list[Law]) -> Claim:
             ),
             rows,
         ),
-        **said("claims/tracking-error-law", t=AT, ratios=(ratios.min(), ratios.max()), moved=moved, other=other),
+        **render_blocks(
+            "claims/tracking-error-law", t=AT, ratios=(ratios.min(), ratios.max()), moved=moved, other=other
+        ),
     )
 
 

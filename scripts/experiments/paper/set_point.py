@@ -13,7 +13,7 @@ from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.certificate.certificate import Certificate
 from scripts.experiments.certificate.gradient_bounds import Bound
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.lyapunov import Record
 from scripts.experiments.paper.set_point_experiments import (
@@ -75,7 +75,7 @@ def lyapunov_claim(records: dict[str, Record], figures: Path) -> Claim:
         verdict="holds" if confirmed else "does not hold",
         figures=(draw_lyapunov(records, figures),),
         table=(("formulation", "largest increase (J)", "rounding (J)", "rate: relative difference"), rows),
-        **said(
+        **render_blocks(
             "claims/set-point-lyapunov",
             start=records[rows[0][0]].value[0],
             increase=worst,
@@ -100,7 +100,7 @@ def gradient_claim(case: Case, checked: tuple[float, float, int], branches: list
         verdict="holds" if bounded else "holds with a condition",
         figures=(draw_bounds(branches, case.controller.K_P, figures),),
         table=(("|s| >=", *(f"M_1, {x}" for x in of), *(f"smallest eigenvalue, {x}" for x in of)), rows),
-        **said(
+        **render_blocks(
             "claims/set-point-gradient-bound",
             used=used,
             error=error,
@@ -153,7 +153,7 @@ def gain_claim(
             ),
             rows,
         ),
-        **said(
+        **render_blocks(
             "claims/set-point-gain-condition",
             certificate=proof,
             entered=entered,
@@ -179,7 +179,7 @@ def uniqueness_claim(
         verdict="holds" if unique else "does not hold",
         commands=(f"ckc run {SCENE} --set controller.K_P=0.5 --set t_end=60",),
         table=(("start, gain", "gain condition", "solutions", "stable", "stable at (rad)"), rows),
-        **said(
+        **render_blocks(
             "claims/set-point-unique",
             unique=unique,
             solutions_of_scene=len(solutions[own_name]),

@@ -16,7 +16,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.mechanism import Mechanism
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.crossing import Crossing, cross
 from scripts.experiments.paper.five_bar import FIVE_BAR, PRINTED, Links, elbow_distance, links, wrap
@@ -116,7 +116,7 @@ def _type_1(by_mechanism: dict[str, list[Locus]], figure: str) -> Claim:
         key="singular-type-1",
         verdict="holds with a condition" if len(ours) == 2 and not printed else "does not hold",
         figures=(figure,),
-        **said(
+        **render_blocks(
             "claims/singular-type-1",
             points=[locus.q[0] for locus in ours],
             turn=turn,
@@ -147,7 +147,7 @@ def _type_2(by_mechanism: dict[str, list[Locus]], figure: str) -> Claim:
         verdict="holds" if good and len(rows) == 2 else "does not hold",
         figures=(figure,),
         table=(("mechanism", "points", "curve", "l2 + l4 (m)", "largest deviation (m)"), tuple(rows)),
-        **said("claims/singular-type-2", curves=len(rows)),
+        **render_blocks("claims/singular-type-2", curves=len(rows)),
     )
 
 
@@ -171,7 +171,7 @@ def _freedoms(all_loci: list[tuple[str, Locus]], crossings: Sequence[tuple[str, 
              "a chart there: sigma_min", "smallest along curve"),
             tuple(rows),
         ),
-        **said(
+        **render_blocks(
             "claims/singular-freedoms",
             curves=len(all_loci),
             sigma_min_J=min(locus.sigma_min_J for _, locus in all_loci),

@@ -15,7 +15,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from scripts.experiments.chart import BLACK, COLOURS, chart, save
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper import boundary_layer
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.experiment import W0, Problem, difference, end_of, five_bar_problem, vector
@@ -138,7 +138,7 @@ def order_claim(rest: Convergence, moving: Convergence, start: str, figure: str)
             ("ε", *(f"{s}: {c}" for s in ("rest", "moving") for c in ("(q, q̇)", "order", "z", "order"))),
             tuple(rows),
         ),
-        **said(
+        **render_blocks(
             "claims/tikhonov-order",
             start=start,
             t_end=T_END,
@@ -162,7 +162,7 @@ def velocity_claim(
         verdict="holds" if converges else "does not hold",
         figures=(figure,),
         table=(("ε", *heads), tuple(rows)),
-        **said(
+        **render_blocks(
             "claims/tikhonov-velocity",
             floor=moving.x[-1],
             epsilon=moving.epsilons[-1],
@@ -179,7 +179,9 @@ def _certainty(*studies: Convergence) -> str:
     unsure = max(float(np.max(np.append(s.x_uncertainty / s.x, s.z_uncertainty / s.z))) for s in studies)
     resolved = all(s.resolved for s in studies)
     (first, rtol), (second, _) = FIRST, SECOND
-    text = said("claims/measured_twice", first=first, second=second, rtol=rtol, unsure=unsure, resolved=resolved)
+    text = render_blocks(
+        "claims/measured_twice", first=first, second=second, rtol=rtol, unsure=unsure, resolved=resolved
+    )
     return str(text["certainty"])
 
 

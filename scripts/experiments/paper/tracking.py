@@ -14,7 +14,7 @@ from ckc_pin.control.spec import HarmonicsSpec
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
-from scripts.experiments.pages import said
+from scripts.experiments.pages import render_blocks
 from scripts.experiments.paper.claim import Claim
 from scripts.experiments.paper.deviations import PERIOD, Deviation
 from scripts.experiments.paper.lyapunov import Record
@@ -98,7 +98,7 @@ def lyapunov_claim(
         verdict="does not hold" if not kept else "holds" if rho <= RATE_TOLERANCE else "holds with a condition",
         figures=(draw_lyapunov(whole, drawn, layer, figures),),
         table=(("run", "w(0) (m)", "C at", "t (s)", "rate: relative difference", "V rises by (J)"), tuple(rows)),
-        **said(
+        **render_blocks(
             "claims/tracking-lyapunov",
             on=max(x.mismatch for x in on),
             start=next(iter(first.values())).value[0],
@@ -143,7 +143,7 @@ def skew_claim(by_epsilon: Mapping[float, Skewness]) -> Claim:
              "off: actual, C at rho q_dot"),
             rows,
         ),
-        **said(
+        **render_blocks(
             "claims/tracking-skew", states=next(iter(by_epsilon.values())).states, on=on, actual=actual,
             mixed=(min(mixed), max(mixed)), level=level,
         ),
@@ -179,7 +179,8 @@ def gains_claim() -> Claim:
              "smallest eigenvalue: Lambda^T K_D", "smallest eigenvalue: -dV_1/dt", "accepted by the program"),
             tuple(rows),
         ),
-        **said("claims/tracking-gains", fit=max(fits), misfit=min(misfits), eigenvalue=rows[-1][5], printed=rows[0][3]),
+        **render_blocks("claims/tracking-gains",
+                        fit=max(fits), misfit=min(misfits), eigenvalue=rows[-1][5], printed=rows[0][3]),
     )  # fmt: skip
 
 
@@ -213,7 +214,7 @@ def deviations_claim(t: Array, error: Array, by_setting: Mapping[str, Deviation]
             ("run", "largest deviation (rad)", "share that repeats", "strongest period (2π s)", "largest |phi| (m)"),
             tuple((name, *_deviation_cells(x)) for name, x in by_setting.items()),
         ),
-        **said(
+        **render_blocks(
             "claims/tracking-deviations",
             tight=largest,
             loose=(min(x.largest for x in loose), max(x.largest for x in loose)),

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from math import acos, cos, hypot, pi, sin, sqrt
 from typing import Any
 
-from scripts.experiments.stability.cell import Case, How
+from scripts.experiments.stability.cell import Case, Variant
 from scripts.experiments.stability.equations import set_point, tracking
 from scripts.experiments.stability.planar import JointSpring, LineSpring, Planar
-from scripts.experiments.stability.reference import ByHand, OneAngle, PublishedValues, Returns
+from scripts.experiments.stability.reference import FiveBarEquations, NFourBarClosedForm, PublishedValues, Returns
 
 __all__ = ["GROUPS"]
 
@@ -22,7 +22,7 @@ PAPER = Planar()
 EQUILIBRIUM = (-1.4343085080901642, -1.7073321688743597)  # theta_1, theta_3 of the hanging five-bar
 SWING = (EQUILIBRIUM[0] + 0.5, EQUILIBRIUM[1] + 0.5)
 TYPE_1 = acos(PAPER.base / 2 / PAPER.l[0])  # rad: theta_1 at which both elbows coincide, with theta_3 = pi - theta_1
-MODELS = (How("reduced"), How("spf"), How("dae"))
+MODELS = (Variant("reduced"), Variant("spf"), Variant("dae"))
 OUTPUTS = 20
 
 
@@ -38,10 +38,10 @@ def _scene(q: tuple[float, float], t_end: float, q_dot: tuple[float, float] = (0
 def methods() -> Iterator[Case]:
     """Yield the swing by every method at three tolerances."""
     for rtol in (1e-5, 1e-8, 1e-11):
-        how = [How(f, m, rtol) for f in ("reduced", "dae") for m in ("auto", "DOP853", "RK45", "Radau")]
-        how += [How("spf", m, rtol, printed=True) for m in ("DOP853", "RK45", "Radau")]
+        variants = [Variant(f, m, rtol) for f in ("reduced", "dae") for m in ("auto", "DOP853", "RK45", "Radau")]
+        variants += [Variant("spf", m, rtol, printed=True) for m in ("DOP853", "RK45", "Radau")]
         scene = {**_scene(SWING, 1.0), "epsilon": 1e-3}
-        yield Case("method", f"swing at rtol {rtol:g}", "five_bar", scene, ByHand(PAPER), tuple(how))
+        yield Case("method", f"swing at rtol {rtol:g}", "five_bar", scene, FiveBarEquations(PAPER), tuple(variants))
 
 
 def epsilons() -> Iterator[Case]:
@@ -52,14 +52,14 @@ def epsilons() -> Iterator[Case]:
     for exponent in range(-1, -13, -1):
         epsilon = 10.0**exponent
         for name, w in levels.items():
-            how = [How("spf"), How("spf", "Radau", printed=True)]
+            variants = [Variant("spf"), Variant("spf", "Radau", printed=True)]
             if epsilon >= 1e-3:  # explicit methods need steps of the size of epsilon
-                how += [How("spf", m, printed=True) for m in ("RK45", "DOP853")]
+                variants += [Variant("spf", m, printed=True) for m in ("RK45", "DOP853")]
             scene = {**_scene(SWING, 1.0, q_dot), "epsilon": epsilon}
             if any(w):
                 scene["initial.w"] = list(w)
-            reference = ByHand(PAPER, w=w, epsilon=epsilon)
-            yield Case("epsilon", f"{epsilon:.0e}, {name}", "five_bar", scene, reference, tuple(how), not any(w))
+            reference = FiveBarEquations(PAPER, w=w, epsilon=epsilon)
+            yield Case("epsilon", f"{epsilon:.0e}, {name}", "five_bar", scene, reference, tuple(variants), not any(w))
 
 
 def _elbows(p: Planar, q: tuple[float, float]) -> float:
@@ -72,7 +72,7 @@ def masses() -> Iterator[Case]:
         r = 10.0**exponent
         for name, factors in (("link 2", (1.0, r, 1.0, 1.0)), ("left chain", (r, r, 1.0, 1.0))):
             p = PAPER.heavier(factors)
-            yield Case("mass", f"{name} x {r:.0e}", p, _scene(SWING, 1.0), ByHand(p), MODELS)
+            yield Case("mass", f"{name} x {r:.0e}", p, _scene(SWING, 1.0), FiveBarEquations(p), MODELS)
 
 
 def lengths() -> Iterator[Case]:
@@ -80,7 +80,7 @@ def lengths() -> Iterator[Case]:
     for exponent in range(-3, 4):
         s = 10.0**exponent
         p = PAPER.longer(s / PAPER.base)
-        yield Case("length", f"base {s:g} m", p, _scene(SWING, 2.0 * sqrt(s)), ByHand(p), MODELS)
+        yield Case("length", f"base {s:g} m", p, _scene(SWING, 2.0 * sqrt(s)), FiveBarEquations(p), MODELS)
 
 
 def gains() -> Iterator[Case]:
@@ -95,15 +95,15 @@ def gains() -> Iterator[Case]:
         scene = _scene(EQUILIBRIUM, t_end)
         q_d = {"theta_1": target[0], "theta_3": target[1]}
         scene["controller"] = {"type": "set_point", "K_P": K_P, "K_V": K_V, "q_d": q_d}
-        reference = ByHand(PAPER, set_point(PAPER, target, K_P, K_V))
+        reference = FiveBarEquations(PAPER, set_point(PAPER, target, K_P, K_V))
         yield Case("gain", f"set point, K_P = {K_P:g}, K_V = {K_V:g}", "five_bar", scene, reference, MODELS, False)
     for exponent in range(-3, 7):
         K_D = 10.0**exponent
         scene = _scene(EQUILIBRIUM, 3.0)
         scene["controller"] = {"type": "tracking", "Lambda": 1.0, "K_D": K_D, "desired": _EQ_21}
-        stiff = (How("reduced", "Radau"), How("spf", "Radau", printed=True)) if exponent >= 2 else ()
+        stiff = (Variant("reduced", "Radau"), Variant("spf", "Radau", printed=True)) if exponent >= 2 else ()
         scene["epsilon"] = 1e-4
-        reference = ByHand(PAPER, tracking(1.0, K_D))
+        reference = FiveBarEquations(PAPER, tracking(1.0, K_D))
         yield Case("gain", f"tracking, K_D = {K_D:g}", "five_bar", scene, reference, (*MODELS, *stiff), False)
 
 
@@ -123,7 +123,9 @@ def near_singular() -> Iterator[Case]:
             ("type 1 below", (-TYPE_1 - delta, TYPE_1 - pi)),
             ("type 2", (-2.0, stretched - delta)),
         ):
-            yield Case("singular", f"{name}, {delta:.0e} away", "five_bar", _scene(q, 0.5), ByHand(PAPER), MODELS)
+            yield Case(
+                "singular", f"{name}, {delta:.0e} away", "five_bar", _scene(q, 0.5), FiveBarEquations(PAPER), MODELS
+            )
 
 
 def _stretched(p: Planar, theta_1: float) -> float:
@@ -141,10 +143,10 @@ def speeds() -> Iterator[Case]:
         rate = 10.0**exponent
         for name, ratio in (("together", 1.0), ("apart", -0.3)):
             scene = _scene(EQUILIBRIUM, min(1.0, 5.0 / rate), (rate, ratio * rate))
-            yield Case("speed", f"{rate:g} rad/s, {name}", "five_bar", scene, ByHand(PAPER), MODELS)
+            yield Case("speed", f"{rate:g} rad/s, {name}", "five_bar", scene, FiveBarEquations(PAPER), MODELS)
     for rate in (6.0, 9.0, 12.0):
         scene = _scene(EQUILIBRIUM, 0.5, (rate, -rate))  # errors grow by 1e4 in two seconds
-        yield Case("speed", f"crossing type 2, {rate:g} rad/s", "five_bar", scene, ByHand(PAPER), MODELS)
+        yield Case("speed", f"crossing type 2, {rate:g} rad/s", "five_bar", scene, FiveBarEquations(PAPER), MODELS)
 
 
 def springs() -> Iterator[Case]:
@@ -154,14 +156,16 @@ def springs() -> Iterator[Case]:
         line = LineSpring(k, 0.0, 0.5, 0.1, 0.1)
         t_end = min(1.0, 60.0 / sqrt(k / 0.1))
         p = Planar(line=line)
-        yield Case("spring", f"line {k:.0e} N/m", p, _scene(SWING, t_end), ByHand(p), MODELS)
+        yield Case("spring", f"line {k:.0e} N/m", p, _scene(SWING, t_end), FiveBarEquations(p), MODELS)
         damped = Planar(line=LineSpring(k, 2.0 * sqrt(k), 0.5, 0.1, 0.1))
-        reference = ByHand(damped, stiff=True)
+        reference = FiveBarEquations(damped, stiff=True)
         scene = _scene(SWING, min(1.0, 10 * t_end))
         yield Case("spring", f"line {k:.0e} N/m, damped", damped, scene, reference, MODELS, False)
     for k in (1e3, 1e6, 1e9):
         p = Planar(joint=JointSpring(k, 0.0, SWING[0] + 1e-3))
-        yield Case("spring", f"joint {k:.0e} N m/rad", p, _scene(SWING, 60.0 / sqrt(k / 0.02)), ByHand(p), MODELS)
+        yield Case(
+            "spring", f"joint {k:.0e} N m/rad", p, _scene(SWING, 60.0 / sqrt(k / 0.02)), FiveBarEquations(p), MODELS
+        )
 
 
 ANDREWS_START = {
@@ -190,9 +194,9 @@ def published() -> Iterator[Case]:
     """Yield Andrews' squeezer, Bricard's mechanism and N-four-bars."""
     andrews = {"initial.q": ANDREWS_START, "t_end": 0.03, "solver.output_dt": 0.03}
     source = "published values (Hairer and Wanner), thirteen digits"
-    implicit = How("dae", "Radau"), How("reduced", "Radau")
-    tolerances = How("reduced", rtol=1e-10), How("dae", rtol=1e-5), How("dae", rtol=1e-11)
-    ways: tuple[How, ...] = (*MODELS, *implicit, How("dae", "RK45"), *tolerances)
+    implicit = Variant("dae", "Radau"), Variant("reduced", "Radau")
+    tolerances = Variant("reduced", rtol=1e-10), Variant("dae", rtol=1e-5), Variant("dae", rtol=1e-11)
+    ways: tuple[Variant, ...] = (*MODELS, *implicit, Variant("dae", "RK45"), *tolerances)
     yield Case("published", "Andrews", "andrews", andrews, PublishedValues(source, 1e-12, ANDREWS), ways)
     bricard = {"initial.at": "assembled", "solver.output_dt": 0.05}
     position = PublishedValues("published position, eight digits", 1e-8, points={"P3": BRICARD_P3})
@@ -205,12 +209,14 @@ def published() -> Iterator[Case]:
         row = {"initial.q": {"theta_0": pi / 2}, "initial.q_dot": {"theta_0": -1.0}}
         generated = {"generator": "n_four_bar", "N": N}
         short = {**row, "t_end": 0.6, "solver.output_dt": 0.05}
-        yield Case("published", f"N-four-bar, N = {N}, 0.6 s", generated, short, OneAngle(k), MODELS)
+        yield Case("published", f"N-four-bar, N = {N}, 0.6 s", generated, short, NFourBarClosedForm(k), MODELS)
         if N == 40:
             continue
         through = {**row, "t_end": 3.0 if N > 2 else 10.0, "solver.output_dt": 0.25}
-        ways = tuple(How("dae", rtol=rtol) for rtol in (1e-6, 1e-8, 1e-10))
-        yield Case("published", f"N-four-bar, N = {N}, through rank losses", generated, through, OneAngle(k), ways)
+        ways = tuple(Variant("dae", rtol=rtol) for rtol in (1e-6, 1e-8, 1e-10))
+        yield Case(
+            "published", f"N-four-bar, N = {N}, through rank losses", generated, through, NFourBarClosedForm(k), ways
+        )
 
 
 GROUPS = {

@@ -20,7 +20,7 @@ from ckc_pin.scene.scene import apply_overrides, make_scene
 from scripts.experiments.stability.planar import Planar
 from scripts.experiments.stability.reference import Reference
 
-__all__ = ["ALLOWED", "BUDGET", "Case", "Cell", "How", "Verdict", "kinetic_energies", "run_case"]
+__all__ = ["ALLOWED", "BUDGET", "Case", "Cell", "Variant", "Verdict", "kinetic_energies", "run_case"]
 
 Verdict = Literal["within", "stopped", "FAILED"]
 
@@ -30,7 +30,7 @@ BUDGET = {"solver.max_rhs": 30_000, "solver.max_wall_s": 300.0}
 
 
 @dataclass(frozen=True)
-class How:
+class Variant:
     """A formulation and a method, with the SPF in the coordinates of eq. 17 or as eq. 8 is printed."""
 
     formulation: str
@@ -66,7 +66,7 @@ class Case:
     overrides : mapping
         Other values of the scene, by dotted key.
     reference : Reference
-    how : tuple of How
+    variants : tuple of Variant
     conserves : bool
         Whether energy should be conserved.
     """
@@ -76,7 +76,7 @@ class Case:
     mechanism: Planar | str | Mapping[str, Any]
     overrides: Mapping[str, Any]
     reference: Reference
-    how: tuple[How, ...]
+    variants: tuple[Variant, ...]
     conserves: bool = True
 
 
@@ -128,12 +128,20 @@ def run_case(case: Case) -> list[Cell]:
             mechanism.write(Path(folder))
             mechanism = "mechanism.toml"
         data = apply_overrides({"mechanism": mechanism}, {**BUDGET, **case.overrides})
-        return [_run_cell(case, how, apply_overrides(data, how.overrides), Path(folder)) for how in case.how]
+        return [
+            _run_cell(case, variant, apply_overrides(data, variant.overrides), Path(folder))
+            for variant in case.variants
+        ]
 
 
-def _run_cell(case: Case, how: How, data: dict[str, Any], folder: Path) -> Cell:
-    key: dict[str, Any] = {"group": case.group, "case": case.name, "formulation": how.label, "method": how.method}
-    key.update(rtol=how.rtol, reference=case.reference.source)
+def _run_cell(case: Case, variant: Variant, data: dict[str, Any], folder: Path) -> Cell:
+    key: dict[str, Any] = {
+        "group": case.group,
+        "case": case.name,
+        "formulation": variant.label,
+        "method": variant.method,
+    }
+    key.update(rtol=variant.rtol, reference=case.reference.source)
     started = process_time()
     try:
         run = simulate(make_scene(data, f"{case.group}: {case.name}", Sources(case.name, folder)))
@@ -142,8 +150,8 @@ def _run_cell(case: Case, how: How, data: dict[str, Any], folder: Path) -> Cell:
     except Exception as crash:  # any other exception is a failure
         return Cell(**key, verdict="FAILED", cpu_s=process_time() - started, message=f"{type(crash).__name__}: {crash}")
     spent = process_time() - started
-    allowed = ALLOWED * how.rtol
-    if how.method == "auto":
+    allowed = ALLOWED * variant.rtol
+    if variant.method == "auto":
         key["method"] = f"auto: {run.stats['method']}"
     right = case.reference
     error, max_phi = right.error(run), right.phi(run)

@@ -14,7 +14,7 @@ from ckc_pin.run.run import Run
 from scripts.experiments.stability.equations import Control, Reduced, free_motion, miss, to_absolute, uncontrolled
 from scripts.experiments.stability.planar import Planar
 
-__all__ = ["ByHand", "OneAngle", "PublishedValues", "Reference", "Returns", "gap"]
+__all__ = ["FiveBarEquations", "NFourBarClosedForm", "PublishedValues", "Reference", "Returns", "gap"]
 
 TIGHT = 1e-13
 NOT_STIFF = ("DOP853", TIGHT), ("LSODA", 1e-12)  # the reference, and a second solver for its uncertainty
@@ -47,7 +47,7 @@ def gap(ours: Array, right: Array) -> float:
 
 
 @dataclass
-class ByHand:
+class FiveBarEquations:
     """The five-bar's `equations`, integrated by SciPy at 1e-13 from the start of the run.
 
     The free motion with w(0) = 0 is integrated in the links' angles, any other by eq. 6 with intersecting circles.
@@ -206,7 +206,7 @@ class Returns(_Published):
 
 
 @dataclass
-class OneAngle:
+class NFourBarClosedForm:
     """The N-four-bar, whose rods all have one angle: theta'' = -k cos(theta), psi = -theta."""
 
     k: float

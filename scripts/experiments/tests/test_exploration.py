@@ -27,7 +27,7 @@ def test_flood_explores_disc_and_its_edges() -> None:
     assert explored.water == sorted(explored.water)
     assert not explored.ends
     assert not explored.sampled
-    assert not explored.full
+    assert not explored.truncated
 
 
 def test_node_behind_ridge_has_level_of_ridge() -> None:
@@ -56,14 +56,14 @@ def test_rays_stay_below_level() -> None:
 
 def test_find_minimum_reaches_constrained_minimum() -> None:
     mechanism = pendulum(2)
-    found = find_minimum(
+    minimum = find_minimum(
         mechanism,
         sigma(mechanism, np.array([1.0, 1.0])).at,
         lambda at: float(1 + np.sum(at.q_tree**2)),
         np.full(2, 0.1),
         lambda at: at if at.q_tree[0] >= 0.5 else None,
     )
-    assert_close(found.q_tree, [0.5, 0.0], 3e-3)
+    assert_close(minimum.q_tree, [0.5, 0.0], 3e-3)
 
 
 def test_follow_stops_at_end_of_branch(five_bar: Pair) -> None:

@@ -90,10 +90,10 @@ def test_commands_on_pages_exist(name: str) -> None:
     lines = {line for block in blocks for line in block.splitlines()}
     keys = {"paper": set(KEYS), "errata": set(ERRATA)}
     page_name = name.removesuffix(".md")
-    said = {tuple(line.split()[1:]) for line in lines if line.startswith("./scripts/experiment ")}
-    assert all(key in keys[experiment] for experiment, key in said)
-    assert {key for experiment, key in said if experiment == page_name} == keys[page_name]
-    for line in lines - {f"./scripts/experiment {' '.join(words)}" for words in said}:
+    render_blocks = {tuple(line.split()[1:]) for line in lines if line.startswith("./scripts/experiment ")}
+    assert all(key in keys[experiment] for experiment, key in render_blocks)
+    assert {key for experiment, key in render_blocks if experiment == page_name} == keys[page_name]
+    for line in lines - {f"./scripts/experiment {' '.join(words)}" for words in render_blocks}:
         assert line == "./scripts/demo" or line.startswith("ckc ")
 
 

@@ -191,10 +191,10 @@ def test_run_over_budget_is_refused_in_advance(exact: Reference) -> None:
 
 
 def test_missing_programs_give_reason() -> None:
-    said = {peer.name: peer.missing(BY_KEY["tracking_1e-04"]) for peer in peers()}
-    for name in set(said) - {"SUNDIALS IDA"}:
-        assert said[name]
-    assert said["SUNDIALS IDA"] is None
+    render_blocks = {peer.name: peer.missing(BY_KEY["tracking_1e-04"]) for peer in peers()}
+    for name in set(render_blocks) - {"SUNDIALS IDA"}:
+        assert render_blocks[name]
+    assert render_blocks["SUNDIALS IDA"] is None
     andrews = {peer.name: peer.missing(BY_KEY["andrews"]) for peer in peers() if peer.name != LOOP}
     assert andrews["Pinocchio constraintDynamics"]
 

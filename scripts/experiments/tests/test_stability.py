@@ -13,12 +13,12 @@ from ckc_pin import Run
 from ckc_pin.kinematics import load
 from scripts.experiments.stability import equations
 from scripts.experiments.stability.cases import GROUPS, MODELS, PAPER, SWING
-from scripts.experiments.stability.cell import Case, Cell, How, run_case
+from scripts.experiments.stability.cell import Case, Cell, Variant, run_case
 from scripts.experiments.stability.equations import Reduced, free_motion, to_absolute
 from scripts.experiments.stability.long_runs import LONG_RUN_SETTINGS, long_run
 from scripts.experiments.stability.page import TITLES, as_frame, page, satisfied, save
 from scripts.experiments.stability.planar import JointSpring, LineSpring, Planar
-from scripts.experiments.stability.reference import ByHand, gap
+from scripts.experiments.stability.reference import FiveBarEquations, gap
 from tests.analytic.five_bar import Array, Controller, FiveBar, Q, no_control, set_point, tracking
 from tests.conftest import assert_close
 
@@ -119,20 +119,20 @@ def test_written_files_equal_shipped_five_bar(tmp_path: Path) -> None:
 SHORT_SWING = {"initial.q": {"theta_1": SWING[0], "theta_3": SWING[1]}, "t_end": 0.2, "solver.output_dt": 0.1}
 
 
-def judge(reference: ByHand, how: How = MODELS[2], **overrides: object) -> Cell:
+def run_cell(reference: FiveBarEquations, variant: Variant = MODELS[2], **overrides: object) -> Cell:
     case = Case(
         "method",
         "short",
         "five_bar",
         {**SHORT_SWING, **{k.replace("__", "."): v for k, v in overrides.items()}},
         reference,
-        (how,),
+        (variant,),
     )
     return run_case(case)[0]
 
 
 def test_accurate_run_is_within() -> None:
-    cell = judge(ByHand(PAPER))
+    cell = run_cell(FiveBarEquations(PAPER))
     assert (cell.verdict, cell.t) == ("within", 0.2)
     assert cell.error <= 1e-7 < cell.allowed
     assert cell.uncertainty <= 1e-10
@@ -140,12 +140,12 @@ def test_accurate_run_is_within() -> None:
 
 def test_inaccurate_run_has_failed() -> None:
     """A link of the reference is 1 % heavier than in the run."""
-    cell = judge(ByHand(PAPER.heavier((1.0, 1.01, 1.0, 1.0))))
+    cell = run_cell(FiveBarEquations(PAPER.heavier((1.0, 1.01, 1.0, 1.0))))
     assert cell.verdict == "FAILED"
     assert cell.allowed < cell.error < 1e-2
 
 
-class Open(ByHand):
+class Open(FiveBarEquations):
     """A reference that reports |phi| = 1 mm."""
 
     def phi(self, run: Run) -> float:
@@ -153,17 +153,17 @@ class Open(ByHand):
 
 
 def test_open_loops_have_failed() -> None:
-    assert judge(Open(PAPER)).verdict == "FAILED"
+    assert run_cell(Open(PAPER)).verdict == "FAILED"
 
 
 def test_exhausted_budget_gives_reason() -> None:
-    cell = judge(ByHand(PAPER), solver__max_rhs=50)
+    cell = run_cell(FiveBarEquations(PAPER), solver__max_rhs=50)
     assert cell.verdict == "stopped"
     assert "max_rhs = 50" in cell.message
 
 
 def test_case_that_raises_has_failed() -> None:
-    cell = judge(ByHand(PAPER), solver__no_such_key=1)
+    cell = run_cell(FiveBarEquations(PAPER), solver__no_such_key=1)
     assert cell.verdict == "FAILED"
     assert "no_such_key" in cell.message
 
@@ -213,7 +213,12 @@ def test_case_names_are_unique_and_groups_have_titles() -> None:
 def test_committed_table_has_all_cases_and_is_satisfied() -> None:
     table = pd.read_csv(DOCS / "stability.csv.gz")
     committed = list(zip(table.group, table.case, table.formulation, table.method.str.partition(":")[0], strict=True))
-    cells = [(c.group, c.name, how.label, how.method) for cases in GROUPS.values() for c in cases() for how in c.how]
+    cells = [
+        (c.group, c.name, variant.label, variant.method)
+        for cases in GROUPS.values()
+        for c in cases()
+        for variant in c.variants
+    ]
     assert committed == cells
     assert satisfied(table)
 
@@ -240,8 +245,8 @@ def test_cells_are_within_tolerance(group: str) -> None:
     cases = [case for case in GROUPS[group]() if case.name in names]
     assert len(cases) == len(names)
     for case in cases:
-        how = next(how for how in case.how if how.formulation == formulation)
-        cell = run_case(replace(case, how=(how,)))[0]
+        variant = next(variant for variant in case.variants if variant.formulation == formulation)
+        cell = run_case(replace(case, variants=(variant,)))[0]
         assert cell.verdict == "within", f"{case.name}: {cell.verdict}, error {cell.error:.1e}, {cell.message}"
         assert cell.uncertainty <= 0.1 * cell.allowed
 
@@ -255,7 +260,9 @@ def test_singular_start_is_rejected() -> None:
 
 def test_chart_is_changed_before_first_step() -> None:
     case = next(case for case in GROUPS["singular"]() if case.name == "type 1 above, 1e-04 away")
-    assert run_case(replace(case, overrides={**case.overrides, "solver.max_rhs": 1}, how=MODELS[:1]))[0].switches == 1
+    assert (
+        run_case(replace(case, overrides={**case.overrides, "solver.max_rhs": 1}, variants=MODELS[:1]))[0].switches == 1
+    )
 
 
 # --- long runs -------------------------------------------------------------------------------------

@@ -49,8 +49,10 @@ def program() -> tuple[Path, str | None]:
 @cache
 def version() -> str:
     """Return the versions of Pinocchio, Boost and the compiler."""
-    said = subprocess.run([compiler() or "c++", "--version"], capture_output=True, text=True).stdout.splitlines()[0]
-    return f"{metadata.version('libpinocchio')}, Boost {metadata.version('cmeel-boost')}, {said}"
+    render_blocks = subprocess.run(
+        [compiler() or "c++", "--version"], capture_output=True, text=True
+    ).stdout.splitlines()[0]
+    return f"{metadata.version('libpinocchio')}, Boost {metadata.version('cmeel-boost')}, {render_blocks}"
 
 
 @cache

@@ -91,8 +91,8 @@ class Drake:
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-        solver, *said = setting.split(", ")
-        numbers = [float(number) for part in said for number in part.split() if number[0].isdigit()]
+        solver, *render_blocks = setting.split(", ")
+        numbers = [float(number) for part in render_blocks for number in part.split() if number[0].isdigit()]
         discrete = solver == "SAP"
         dt = numbers[0] if discrete else work.t_end  # an integrator with its own steps advances from instant to instant
         plant = _Plant(work.mechanism, dividing_step(work, dt)) if discrete else _Plant(work.mechanism, 0.0, numbers[0])

@@ -85,13 +85,13 @@ class Mujoco:
         terms = Terms(work.mechanism, work.mechanism.kinematics(q_tree), v_tree)
         ours = dae_acceleration(terms, np.zeros(tree.n))
         mass = np.abs(to.T @ M @ to - terms.D_tree).max() / np.abs(terms.D_tree).max()
-        said = f"D' agrees to {mass:.0e}"
+        render_blocks = f"D' agrees to {mass:.0e}"
         if tree.is_euclidean:
             bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
             off = np.abs(to.T @ data.qfrc_bias - bias).max() / max(float(np.abs(bias).max()), 1e-12)
             apart = np.abs(to.T @ data.qacc - ours).max() / max(float(np.abs(ours).max()), 1.0)
-            said += f", the bias to {off:.0e}; the constrained acceleration differs by {apart:.0e}"
-        return said
+            render_blocks += f", the bias to {off:.0e}; the constrained acceleration differs by {apart:.0e}"
+        return render_blocks
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         integrator, stiffness, step = setting.split(", ")

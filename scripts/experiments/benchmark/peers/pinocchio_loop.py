@@ -76,8 +76,8 @@ class PinocchioLoop:
         except subprocess.TimeoutExpired:
             return motion_without_data("refused", f"takes longer than the budget, {budget:.0f} s")
         except subprocess.CalledProcessError as error:
-            said = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
-            return motion_without_data("failed", said)
+            render_blocks = " ".join(error.stderr.split()) or f"it ended with {error.returncode}"
+            return motion_without_data("failed", render_blocks)
         states = np.array(answer["state"])
         q_tree = np.array([tree.to_coordinates(state) for state in states[:, : tree.model.nq]])
         wall, steps, rhs = answer["cost"][0]
