@@ -19,10 +19,10 @@ LENGTH_SIGMA, MASS_SIGMA = 2e-4, 0.005  # standard deviations: m, and relative
 OVERRIDES = {"formulation": "reduced", "controller.model": "mechanism.toml", "t_end": 3.0, "solver.rtol": 1e-7}
 
 
-def tip_position(q_tree, left):
-    """Return the position of the tip from the angles and the two lengths of the left chain, m."""
+def tip_position(q_tree, chain_lengths):
+    """Return the position of the tip from the angles and the lengths of the left chain, m."""
     proximal, distal = q_tree[..., 0], q_tree[..., 0] + q_tree[..., 1]
-    return np.stack([left[0] * f(proximal) + left[1] * f(distal) for f in (np.cos, np.sin)], axis=-1)
+    return np.stack([chain_lengths[0] * f(proximal) + chain_lengths[1] * f(distal) for f in (np.cos, np.sin)], axis=-1)
 
 
 def sweep(lengths, masses):
@@ -31,8 +31,8 @@ def sweep(lengths, masses):
     variables |= {name: {"normal": [x, MASS_SIGMA * x]} for name, x in MASSES.items() if masses}
     results = ckc_pin.ensemble("five_bar/set_point", variables, {"end": "q_tree", "u": "u"}, members=40, seed=3,
                              overrides=OVERRIDES)  # fmt: skip
-    left = [results[name].to_numpy() if lengths else LENGTHS[name] for name in list(LENGTHS)[:2]]
-    return results, tip_position(results["end"].to_numpy(), left)
+    chain_lengths = [results[name].to_numpy() if lengths else LENGTHS[name] for name in list(LENGTHS)[:2]]
+    return results, tip_position(results["end"].to_numpy(), chain_lengths)
 
 
 @figure_style()

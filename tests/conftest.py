@@ -1,4 +1,4 @@
-"""What all tests share: a deterministic hypothesis profile, the two five-bars, and runs that are made once."""
+"""Shared fixtures: a deterministic hypothesis profile, the two five-bars, caches of compiled terms and of runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ settings.register_profile(
 )
 settings.load_profile("ckc_pin")
 
-# Whoever started the tests may have it ignored, as a shell does for a background job, and commands inherit that.
+# A shell ignores SIGINT for background jobs, and child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -36,7 +36,7 @@ Pair = tuple[Mechanism, FiveBar]
 
 
 def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = False) -> None:
-    """Largest difference of two arrays within a tolerance; `relative` to the largest entry of the second."""
+    """Check the largest difference of two arrays; `relative`: the tolerance is relative to the largest of `theirs`."""
     ours, theirs = np.broadcast_arrays(np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float))
     limit = tolerance * np.abs(theirs).max(initial=0.0) if relative else tolerance
     gap = np.abs(ours - theirs)
@@ -47,7 +47,7 @@ def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = F
 
 @pytest.fixture(scope="session", autouse=True)
 def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What the user or another test has compiled before is not there: nothing can be put where the folder would be."""
+    """Make the cache of compiled terms empty and unwritable, by a file at the path of its folder."""
     cache = tmp_path_factory.mktemp("no_cache")
     (cache / "ckc_pin").touch()
     with pytest.MonkeyPatch.context() as patch:
@@ -57,13 +57,13 @@ def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def writable_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache for tests that compile, which those that look at whose terms they run on do not see."""
+    """Return a cache folder for tests that compile terms. Other tests do not use it."""
     return tmp_path_factory.mktemp("writable_cache")
 
 
 @pytest.fixture(scope="session")
 def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache of terms written out for the mechanisms that behaviour is tested with."""
+    """Return a cache folder with compiled terms of the mechanisms that behaviour is tested with."""
     folder = tmp_path_factory.mktemp("compiled")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
@@ -74,7 +74,7 @@ def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(params=["pinocchio", "generated"])
 def either_terms(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Whose terms runs take, each provider in turn."""
+    """Run a test with Pinocchio's terms and with compiled terms."""
     if request.param == "generated":
         monkeypatch.setenv("XDG_CACHE_HOME", str(request.getfixturevalue("compiled_cache")))
     return str(request.param)
@@ -82,23 +82,23 @@ def either_terms(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 
 @pytest.fixture(scope="session", params=REFERENCES)
 def pair(request: pytest.FixtureRequest) -> Pair:
-    """A shipped five-bar, and the same in numpy: each reading of Table I in turn."""
+    """Return a shipped five-bar and its NumPy reference, for both readings of Table I."""
     return load(request.param), REFERENCES[request.param]
 
 
 @pytest.fixture(scope="session")
 def five_bar() -> Pair:
-    """The default reading of Table I."""
+    """Return the five-bar of the default reading of Table I and its NumPy reference."""
     return load("five_bar"), FIVE_BAR
 
 
 @pytest.fixture(scope="session")
 def run() -> Callable[..., Run]:
-    """`simulate` with a memory: run(scene, formulation="dae", solver__rtol=1e-10) is computed once."""
+    """Return a cached `simulate`: run(scene, formulation="dae", solver__rtol=1e-10) is computed once."""
     done: dict[tuple[Any, ...], Run] = {}
 
     def run(scene: str, **overrides: Any) -> Run:
-        terms = os.environ.get("XDG_CACHE_HOME", "")  # what is compiled there
+        terms = os.environ.get("XDG_CACHE_HOME", "")  # compiled terms are part of the key
         key = (terms, scene, *sorted((name, repr(value)) for name, value in overrides.items()))
         if key not in done:
             done[key] = simulate(scene, {name.replace("__", "."): value for name, value in overrides.items()})

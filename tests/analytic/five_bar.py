@@ -64,11 +64,11 @@ class FiveBar:
         l, c, m, I = self.l, self.c, self.m, self.I
         D = np.zeros((4, 4), dtype=np.asarray(q_tree).dtype)
         for i, j in CHAINS:
-            own = I[j] + m[j] * c[j] ** 2
+            distal_inertia = I[j] + m[j] * c[j] ** 2
             coupling = m[j] * l[i] * c[j] * np.cos(q_tree[j])
-            D[i, i] = I[i] + m[i] * c[i] ** 2 + m[j] * l[i] ** 2 + own + 2 * coupling
-            D[i, j] = D[j, i] = own + coupling
-            D[j, j] = own
+            D[i, i] = I[i] + m[i] * c[i] ** 2 + m[j] * l[i] ** 2 + distal_inertia + 2 * coupling
+            D[i, j] = D[j, i] = distal_inertia + coupling
+            D[j, j] = distal_inertia
         return D
 
     def C_tree(self, q_tree: Array, v_tree: Array) -> Array:

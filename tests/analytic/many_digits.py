@@ -1,9 +1,8 @@
-"""Eq. 1 in many digits and from positions alone: a model of the tests' own, slow, and sharing no formula.
+"""Independent high-precision model of eq. 1, computed from positions only.
 
-Frames are placed joint by joint with mpmath; every velocity, acceleration and Jacobian is a difference of placements,
-every force d'Alembert's. With 80 digits and steps of 1e-20 that leaves about 40 digits; differences of whole solutions
-keep 20. Read from the program are numbers only: the tree's placements, axes and inertias, and what rows and springs
-hold on to.
+Frames are placed joint by joint with mpmath. Velocities, accelerations and Jacobians are differences of placements, and
+forces follow from d'Alembert's principle. Steps of 1e-20 with 80 digits leave about 40 digits; differences of solutions
+leave 20. The model reads only numbers from the package: placements, axes, inertias, and anchors of rows and springs.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 
 mp.mp.dps = 80
-SMALL = mp.mpf(10) ** -20  # of differences within a solution
-STEP = mp.mpf(10) ** -10  # of differences of solutions
+DERIVATIVE_STEP = mp.mpf(10) ** -20  # of differences of placements
+SOLUTION_STEP = mp.mpf(10) ** -10  # of differences of solutions
 
 Vector = Any  # arrays of mpf
 
 
 def exact(x: Any) -> Vector:
-    """The same numbers as mpf."""
+    """Convert an array to mpf."""
     return np.vectorize(mp.mpf, otypes=[object])(np.asarray(x, dtype=float))
 
 
@@ -34,31 +33,31 @@ def hat(a: Vector) -> Vector:
 
 
 def axial(m: Vector) -> Vector:
-    """The vector of a matrix's skew part."""
+    """Return the vector of a matrix's skew-symmetric part."""
     return np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]], dtype=object) / 2
 
 
-def turn(a: Vector) -> Vector:
-    """exp of a rotation vector."""
+def rotation_of(a: Vector) -> Vector:
+    """Return the rotation of a rotation vector."""
     angle = mp.sqrt(a @ a)
     s = hat(a)
-    if angle < SMALL**3:
+    if angle < DERIVATIVE_STEP**3:
         return exact(np.eye(3)) + s
     half = mp.sin(angle / 2)
     return exact(np.eye(3)) + s * (mp.sin(angle) / angle) + (s @ s) * (2 * half**2 / angle**2)
 
 
 def log(R: Vector) -> Vector:
-    """The rotation vector of a rotation by less than half a turn."""
+    """Return the rotation vector of a rotation by less than half a turn."""
     sine = axial(R)
     size = mp.sqrt(sine @ sine)
-    if size < SMALL**3:
+    if size < DERIVATIVE_STEP**3:
         return sine
     return sine * (mp.atan2(size, (R[0, 0] + R[1, 1] + R[2, 2] - 1) / 2) / size)
 
 
 class ManyDigits:
-    """A mechanism's eq. 1."""
+    """Eq. 1 of a mechanism with 80 digits."""
 
     def __init__(self, mechanism: Mechanism) -> None:
         tree, model, springs = mechanism.tree, mechanism.tree.model, mechanism.springs
@@ -66,7 +65,7 @@ class ManyDigits:
         self.joints = [
             (model.parents[k], model.joints[k].idx_v, model.joints[k].nq == 7) for k in range(1, model.njoints)
         ]
-        self.stands = [(exact(x.rotation), exact(x.translation)) for x in list(model.jointPlacements)[1:]]
+        self.placements = [(exact(x.rotation), exact(x.translation)) for x in list(model.jointPlacements)[1:]]
         self.axes = [
             None if free else (exact(tree.axis(k)[0]), tree.axis(k)[1]) for k, (*_, free) in enumerate(self.joints, 1)
         ]
@@ -78,7 +77,7 @@ class ManyDigits:
         )
 
     def configuration(self, q_tree: Any) -> list[Any]:
-        """By joint: a number, or a rotation and a position."""
+        """Return the configuration by joint: a number, or a rotation and a position."""
         result: list[Any] = []
         for k, (*_, free) in enumerate(self.joints, 1):
             at = self.tree.model.joints[k].idx_q
@@ -91,8 +90,8 @@ class ManyDigits:
             result.append((exact(np.eye(3)) + 2 * x[3] * s + 2 * (s @ s), exact(q_tree[at : at + 3])))
         return result
 
-    def moved(self, q: list[Any], v: Vector, a: Vector, t: Any) -> list[Any]:
-        """After a time t along the velocity v and its rate a, to second order."""
+    def move(self, q: list[Any], v: Vector, a: Vector, t: Any) -> list[Any]:
+        """Return the configuration after time t with velocity v and acceleration a, to second order."""
         result: list[Any] = []
         for x, (_, at, free) in zip(q, self.joints, strict=True):
             if not free:
@@ -101,26 +100,26 @@ class ManyDigits:
             R, p = x
             (slide, spin), (slides, spins) = (v[at : at + 3], v[at + 3 : at + 6]), (a[at : at + 3], a[at + 3 : at + 6])
             slides = slides + hat(spin) @ slide
-            result.append((R @ turn(spin * t + spins * (t * t / 2)), p + R @ (slide * t + slides * (t * t / 2))))
+            result.append((R @ rotation_of(spin * t + spins * (t * t / 2)), p + R @ (slide * t + slides * (t * t / 2))))
         return result
 
     def frames(self, q: list[Any]) -> list[tuple[Vector, Vector]]:
-        """Rotation and origin of every body, the world first."""
+        """Return rotation and origin of all bodies, the world first."""
         result = [(exact(np.eye(3)), exact(np.zeros(3)))]
         for k, (x, (parent, _, free)) in enumerate(zip(q, self.joints, strict=True)):
             R, p = result[parent]
-            R, p = R @ self.stands[k][0], p + R @ self.stands[k][1]
+            R, p = R @ self.placements[k][0], p + R @ self.placements[k][1]
             if free:
                 R, p = R @ x[0], p + R @ x[1]
             elif self.axes[k][1]:
-                R = R @ turn(self.axes[k][0] * x)
+                R = R @ rotation_of(self.axes[k][0] * x)
             else:
                 p = p + R @ self.axes[k][0] * x
             result.append((R, p))
         return result
 
-    def numbers(self, q: list[Any]) -> tuple[Vector, Vector]:
-        """What forces and loops see: centres of mass, springs' lengths and phi, stacked; and bodies' rotations."""
+    def positions_and_rotations(self, q: list[Any]) -> tuple[Vector, Vector]:
+        """Return centres of mass, lengths of springs and phi as one vector, and the rotations of bodies."""
         frames = self.frames(q)
         centres = [p + R @ c for (R, p), (_, c, _) in zip(frames[1:], self.bodies, strict=True)]
         ends = self._points(frames, self.springs.anchors)
@@ -165,20 +164,22 @@ class ManyDigits:
         return result
 
     def acceleration(self, q: list[Any], v: Vector, u: Vector) -> tuple[Vector, Vector]:
-        """Eq. 1's acceleration and multipliers."""
-        n, rows, count, h = self.n, self.closure.rows, len(self.bodies), SMALL
-        none, unit = exact(np.zeros(n)), exact(np.eye(n))
-        here, R = self.numbers(q)
-        by_q = np.empty((len(here), n), dtype=object)
+        """Return acceleration and multipliers of eq. 1."""
+        n, rows, count, h = self.n, self.closure.rows, len(self.bodies), DERIVATIVE_STEP
+        zero_vector, unit = exact(np.zeros(n)), exact(np.eye(n))
+        values, R = self.positions_and_rotations(q)
+        by_q = np.empty((len(values), n), dtype=object)
         spins_by_q = np.empty((3 * count, n), dtype=object)
         for k in range(n):
-            (x1, R1), (x0, R0) = (self.numbers(self.moved(q, unit[k], none, s * h)) for s in (1, -1))
+            (x1, R1), (x0, R0) = (
+                self.positions_and_rotations(self.move(q, unit[k], zero_vector, s * h)) for s in (1, -1)
+            )
             by_q[:, k] = (x1 - x0) / (2 * h)
             spins_by_q[:, k] = np.concatenate(
                 [axial((a - b) @ c.T) / (2 * h) for a, b, c in zip(R1, R0, R, strict=True)]
             )
-        (x1, R1), (x0, R0) = (self.numbers(self.moved(q, v, none, s * h)) for s in (1, -1))
-        rate, rates = (x1 - x0) / (2 * h), (x1 - 2 * here + x0) / (h * h)
+        (x1, R1), (x0, R0) = (self.positions_and_rotations(self.move(q, v, zero_vector, s * h)) for s in (1, -1))
+        rate, rates = (x1 - x0) / (2 * h), (x1 - 2 * values + x0) / (h * h)
         D, force = np.diag(self.armature), np.array(u)
         for k, (mass, _, inertia) in enumerate(self.bodies):
             J, W = by_q[3 * k : 3 * k + 3], spins_by_q[3 * k : 3 * k + 3]
@@ -189,7 +190,7 @@ class ManyDigits:
             force = force - mass * (J.T @ (rates[3 * k : 3 * k + 3] - self.gravity))
             force = force - W.T @ (I @ alpha + hat(omega) @ (I @ omega))
         at = slice(3 * count, 3 * count + len(self.stiffness))
-        pull = self.stiffness * (here[at] - self.rest) + self.damping * rate[at]
+        pull = self.stiffness * (values[at] - self.rest) + self.damping * rate[at]
         force = force - by_q[at].T @ pull if len(pull) else force
         force = force + exact(self.springs.constant) - exact(self.springs.joint_damping) * v
         for x, (_, k, free) in zip(q, self.joints, strict=True):
@@ -208,13 +209,17 @@ class ManyDigits:
         result = np.array(list(mp.lu_solve(matrix, right)), dtype=object)
         return result[:n], result[n:]
 
-    def along(self, q_tree: Any, v: Any, u: Any, by: tuple[Any, Any, Any]) -> tuple[Any, Any]:
-        """Derivatives of acceleration and multipliers along steps of q', v' and u', as floats."""
+    def differentiate(self, q_tree: Any, v: Any, u: Any, by: tuple[Any, Any, Any]) -> tuple[Any, Any]:
+        """Return directional derivatives of acceleration and multipliers for directions of q', v' and u', as floats."""
         q, v, u = self.configuration(q_tree), exact(v), exact(u)
         step, dv, du = (exact(x) for x in by)
-        none = exact(np.zeros(self.n))
+        zero_vector = exact(np.zeros(self.n))
         (a1, l1), (a0, l0) = (
-            self.acceleration(self.moved(q, step, none, s * STEP), v + s * STEP * dv, u + s * STEP * du)
+            self.acceleration(
+                self.move(q, step, zero_vector, s * SOLUTION_STEP),
+                v + s * SOLUTION_STEP * dv,
+                u + s * SOLUTION_STEP * du,
+            )
             for s in (1, -1)
         )
-        return tuple(np.array((one - other) / (2 * STEP), dtype=float) for one, other in ((a1, a0), (l1, l0)))  # type: ignore[return-value]
+        return tuple(np.array((one - other) / (2 * SOLUTION_STEP), dtype=float) for one, other in ((a1, a0), (l1, l0)))  # type: ignore[return-value]

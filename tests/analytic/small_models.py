@@ -1,4 +1,4 @@
-"""Small mechanisms of the tests' own, in a folder: a four-bar whose links springs couple, a plate on springs."""
+"""Small test mechanisms as files: a four-bar with springs between its links, and a plate on springs."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ root = "free"
 
 
 def coupled_four_bar(folder: Path, actuated: str = "") -> Mechanism:
-    """Crank, coupler and rocker, a spring with a damper from crank to rocker and one on the coupler's pin."""
+    """Write a four-bar with a spring and damper from crank to rocker and another on the coupler's pin."""
     bars = [("a", 0.15, 0.8), ("b", 0.35, 1.3), ("c", 0.2, 1.0)]
     links = "".join(LINK.format(name=k, x=x, y=0.02, m=m, i=0.01, j=0.02 + x * m / 10) for k, x, m in bars)
     joints = "".join(
@@ -62,11 +62,11 @@ def coupled_four_bar(folder: Path, actuated: str = "") -> Mechanism:
             ("rocker", "ground", "c", 0.6, 0.02),
         ]
     )
-    return _written(folder, f'<link name="ground"/>{links}{joints}', FOUR_BAR.format(actuated=actuated))
+    return _write_and_load(folder, f'<link name="ground"/>{links}{joints}', FOUR_BAR.format(actuated=actuated))
 
 
 def plate_on_springs(folder: Path) -> Mechanism:
-    """Stewart's platform with four of its legs springs with dampers, and two of them struts of constant length."""
+    """Write a Stewart platform with four springs and dampers and two struts of constant length as legs."""
     corners = [(0.3, 0.1), (0.2, 0.25), (-0.25, 0.2), (-0.35, 0.0), (-0.1, -0.3), (0.2, -0.25)]
     feet = [(0.5, 0.3), (0.0, 0.6), (-0.3, 0.5), (-0.6, -0.2), (-0.3, -0.5), (0.4, -0.45)]
     ends = [
@@ -81,10 +81,10 @@ def plate_on_springs(folder: Path) -> Mechanism:
         f'[[loop]]\nname = "strut_{k}"\ntype = "distance"\n{x}length = {0.8 + k / 40}\n' for k, x in enumerate(ends[4:])
     )
     urdf = LINK.format(name="plate", x=0.02, y=-0.03, m=4.0, i=0.2, j=0.35)
-    return _written(folder, urdf, PLATE.format(legs=legs, struts=struts))
+    return _write_and_load(folder, urdf, PLATE.format(legs=legs, struts=struts))
 
 
-def _written(folder: Path, body: str, text: str) -> Mechanism:
+def _write_and_load(folder: Path, body: str, text: str) -> Mechanism:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "it.urdf").write_text(f'<robot name="it">{body}</robot>')
     (folder / "mechanism.toml").write_text(text)

@@ -1,4 +1,4 @@
-"""How motors share a force: against every choice of motors at their limits, and SciPy's linear programs."""
+"""Torque allocation to redundant motors, against enumeration of motors at their limits and SciPy's linear programs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tests.conftest import assert_close
 Array = np.ndarray
 
 
-def nearest(T: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array | None:
-    """The best of all tau that have some motors at a limit and share the rest by the weighted pseudoinverse."""
-    best, least = None, np.inf
+def find_best_torque(T: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array | None:
+    """Return the best tau over all choices of motors at limits; the weighted pseudoinverse gives the other motors."""
+    best, smallest_cost = None, np.inf
     choices = [(-1, 0, 1) if np.isfinite(x) else (0,) for x in limit]
     for signs in product(*choices):
         free = np.array(signs) == 0
@@ -24,13 +24,13 @@ def nearest(T: Array, u: Array, limit: Array, weights: Array, preload: Array) ->
         scale = 1 / np.sqrt(weights[free])
         tau[free] += scale * (np.linalg.pinv(T[:, free] * scale, rcond=1e-10) @ (u - T @ tau))
         cost = float(weights @ (tau - preload) ** 2)
-        if np.abs(T @ tau - u).max() < 1e-9 and np.all(np.abs(tau) <= limit * (1 + 1e-12)) and cost < least:
-            best, least = tau, cost
+        if np.abs(T @ tau - u).max() < 1e-9 and np.all(np.abs(tau) <= limit * (1 + 1e-12)) and cost < smallest_cost:
+            best, smallest_cost = tau, cost
     return best
 
 
-def problems(seed: int) -> tuple[Array, ...]:
-    """T, u, limit, weights and preload; some motors do nothing, some have no limit, some u are out of reach."""
+def random_problem(seed: int) -> tuple[Array, ...]:
+    """Return random T, u, limit, weights and preload. Some motors have no effect or limit; some u are unreachable."""
     rng = np.random.default_rng(seed)
     d = int(rng.integers(1, 4))
     m = d + int(rng.integers(1, 4))
@@ -43,13 +43,13 @@ def problems(seed: int) -> tuple[Array, ...]:
     return T, u, limit, 10.0 ** rng.uniform(-1, 1, m), rng.standard_normal(m) * (seed % 2)
 
 
-def feasible(T: Array, u: Array, limit: Array) -> bool:
+def is_feasible(T: Array, u: Array, limit: Array) -> bool:
     bounds = [(-x, x) if np.isfinite(x) else (None, None) for x in limit]
     return bool(linprog(np.zeros(len(limit)), A_eq=T, b_eq=u, bounds=bounds, method="highs").status == 0)
 
 
-def at_a_price(T: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array:
-    """The tau within limits with the least sum weights (tau - preload)^2 + |T tau - u|^2 / give, rows of one size."""
+def minimize_penalized(T: Array, u: Array, limit: Array, weights: Array, preload: Array) -> Array:
+    """Return the limited tau that minimizes sum weights (tau - preload)^2 + price^2 |T tau - u|^2, T with unit rows."""
     rows = 1 / np.linalg.norm(T, axis=1)
     A = T * rows[:, None]
     price = 1 / np.sqrt(1e-7 * ((A**2).sum(axis=0) / weights).sum())
@@ -58,21 +58,21 @@ def at_a_price(T: Array, u: Array, limit: Array, weights: Array, preload: Array)
     return np.asarray(lsq_linear(left, right, (-limit, limit), method="bvls", tol=1e-15).x)
 
 
-def test_allocation_is_the_nearest_torque_within_limits() -> None:
+def test_allocation_minimizes_the_weighted_torque_at_limits() -> None:
     kinds = {"free": 0, "limited": 0, "out of reach": 0}
     for seed in range(110):
-        T, u, limit, weights, preload = problem = problems(seed)
+        T, u, limit, weights, preload = problem = random_problem(seed)
         tau = allocate(*problem)
-        alone = preload + np.linalg.pinv(T / np.sqrt(weights)) @ (u - T @ preload) / np.sqrt(weights)
-        if not feasible(T, u, limit):
+        unlimited = preload + np.linalg.pinv(T / np.sqrt(weights)) @ (u - T @ preload) / np.sqrt(weights)
+        if not is_feasible(T, u, limit):
             kinds["out of reach"] += 1
-            assert nearest(*problem) is None
-            assert_close(tau, at_a_price(*problem), 1e-7 * np.abs(tau).max())
+            assert find_best_torque(*problem) is None
+            assert_close(tau, minimize_penalized(*problem), 1e-7 * np.abs(tau).max())
             miss = np.linalg.norm((T @ tau - u) / np.linalg.norm(T, axis=1))
-            assert miss < np.linalg.norm((T @ np.clip(alone, -limit, limit) - u) / np.linalg.norm(T, axis=1)) + 1e-6
+            assert miss < np.linalg.norm((T @ np.clip(unlimited, -limit, limit) - u) / np.linalg.norm(T, axis=1)) + 1e-6
             continue
-        kinds["free" if np.all(np.abs(alone) <= limit) else "limited"] += 1
-        best = nearest(*problem)
+        kinds["free" if np.all(np.abs(unlimited) <= limit) else "limited"] += 1
+        best = find_best_torque(*problem)
         assert best is not None
         assert_close(tau, best, 1e-9)
         assert_close(T @ tau, u, 1e-11 * (1 + np.abs(u).max()))
@@ -82,8 +82,8 @@ def test_allocation_is_the_nearest_torque_within_limits() -> None:
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_units_of_freedoms_do_not_matter(unit: float) -> None:
-    """One freedom in metres or millimetres: the same torques."""
-    T, u, limit, weights, preload = problems(11)
+    """The torques do not depend on the unit of a freedom, metres or millimetres."""
+    T, u, limit, weights, preload = random_problem(11)
     rows = np.array([unit, *np.ones(len(u) - 1)])
     again = allocate(T * rows[:, None], u * rows, limit, weights, preload)
     assert_close(again, allocate(T, u, limit, weights, preload), 1e-11)
@@ -91,18 +91,18 @@ def test_units_of_freedoms_do_not_matter(unit: float) -> None:
 
 def test_a_preload_is_its_projection_on_the_null_space() -> None:
     T = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 2.0]])
-    endless, same = np.full(3, np.inf), np.ones(3)
-    tau = allocate(T, np.array([4.0, 6.0]), endless, same, np.array([5.0, -1.0, 7.0]))
+    no_limits, equal_weights = np.full(3, np.inf), np.ones(3)
+    tau = allocate(T, np.array([4.0, 6.0]), no_limits, equal_weights, np.array([5.0, -1.0, 7.0]))
     assert_close(tau, [2.0 + 3.0, 2.0 - 3.0, 3.0], 1e-14)
-    weighted = allocate(T, np.array([4.0, 6.0]), endless, np.array([1.0, 3.0, 1.0]), np.zeros(3))
+    weighted = allocate(T, np.array([4.0, 6.0]), no_limits, np.array([1.0, 3.0, 1.0]), np.zeros(3))
     assert_close(weighted, [3.0, 1.0, 3.0], 1e-14)
 
 
 def test_allocation_is_continuous_where_u_leaves_the_reachable_set() -> None:
-    """By about give times the multipliers at the edge, in what the motors do together."""
+    """The jump of T tau at the edge is about the multipliers divided by the penalty."""
     jumps = []
     for seed in range(60):
-        T, u, limit, weights, preload = problems(seed)
+        T, u, limit, weights, preload = random_problem(seed)
         bounds = [(-x, x) if np.isfinite(x) else (None, None) for x in limit]
         cost = np.r_[np.zeros(len(limit)), -1.0]
         program = linprog(cost, A_eq=np.c_[T, -u], b_eq=0 * u, bounds=[*bounds, (0, 1e3)], method="highs")

@@ -130,8 +130,8 @@ def test_closest_approach_of_the_trajectory_of_eq_21(joint):
     approach = next(a for a in result.path.approaches if a.locus == number)
     theta_1 = np.linspace(-1.5, -1.0, 200001)
     theta_3 = crossing(model, theta_1)
-    near = np.nanmin([np.nanmin(np.hypot(x - theta_1, y - theta_3)) for x, y in q[:, 90000:110000:40].T])
-    assert approach.distance == pytest.approx(near, abs=2e-6)
+    distance_to_curve = np.nanmin([np.nanmin(np.hypot(x - theta_1, y - theta_3)) for x, y in q[:, 90000:110000:40].T])
+    assert approach.distance == pytest.approx(distance_to_curve, abs=2e-6)
     # to type 1: a point
     for number, locus in enumerate(result.loci[:2]):
         approach = next(a for a in result.path.approaches if a.locus == number)
@@ -145,8 +145,8 @@ def crossing(model, theta_1):
     cosine = (abs(way) ** 2 + model.l[2] ** 2 - (model.l[1] + model.l[3]) ** 2) / (2 * abs(way) * model.l[2])
     with np.errstate(invalid="ignore"):
         both = [wrap(np.angle(way) + sign * np.arccos(cosine)) for sign in (1, -1)]
-    near = [np.where(abs(angle - 0.8) < 0.7, angle, np.nan) for angle in both]
-    return np.where(np.isnan(near[0]), near[1], near[0])
+    distance_to_curve = [np.where(abs(angle - 0.8) < 0.7, angle, np.nan) for angle in both]
+    return np.where(np.isnan(distance_to_curve[0]), distance_to_curve[1], distance_to_curve[0])
 
 
 def test_cartesian_workspace_is_the_intersection_of_two_rings(cartesian):

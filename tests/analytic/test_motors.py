@@ -86,12 +86,12 @@ def test_independent_coordinates_prefer_motors(tmp_path: Path, pair: tuple[int, 
 
 
 def test_motors_stay_dependent_if_phi_z_would_be_singular(tmp_path: Path) -> None:
-    """The distal links nearly in line: theta_1 and theta_3 do not determine the rest, one of the two does."""
+    """With nearly aligned distal links theta_1 and theta_3 do not determine the configuration, so only one is in q."""
     shipped = library() / "five_bar"
     (tmp_path / "five_bar.urdf").write_text((shipped / "five_bar.urdf").read_text("utf-8"), "utf-8")
     text = (shipped / "mechanism.toml").read_text("utf-8").replace(INDEPENDENT, "")
     before, _, after = text.partition("[q_guess]")
-    q_tree = stretched()
+    q_tree = nearly_stretched()
     guess = "".join(f"theta_{k + 1} = {x!r}\n" for k, x in enumerate(q_tree.tolist()))
     (tmp_path / "mechanism.toml").write_text(f"{before}[q_guess]\n{guess}{after[after.index('[[') :]}", "utf-8")
     mechanism = load(tmp_path / "mechanism.toml")
@@ -103,20 +103,20 @@ def test_motors_stay_dependent_if_phi_z_would_be_singular(tmp_path: Path) -> Non
     assert abs(np.linalg.det(FIVE_BAR.J(mechanism.q_tree)[:, z])) > 0.01
 
 
-def stretched() -> np.ndarray:
-    """A closed configuration with the distal links 1e-3 rad from one line."""
+def nearly_stretched() -> np.ndarray:
+    """Return a closed configuration with the distal links 1e-3 rad from alignment."""
     l = FIVE_BAR.l
     reach = np.sqrt(l[1] ** 2 + l[3] ** 2 + 2 * l[1] * l[3] * np.cos(1e-3))  # between the elbows
     theta_1 = 2.0
     left = l[0] * np.array([np.cos(theta_1), np.sin(theta_1)])
 
-    def apart(theta_3: float) -> float:
+    def elbow_gap(theta_3: float) -> float:
         right = l[2] * np.array([np.cos(theta_3), np.sin(theta_3)]) + [FIVE_BAR.base, 0.0]
         return float(np.linalg.norm(right - left)) - reach
 
     low, high = 0.0, 2.0
-    assert apart(low) > 0 > apart(high)
+    assert elbow_gap(low) > 0 > elbow_gap(high)
     for _ in range(100):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if apart(middle) > 0 else (low, middle)
+        low, high = (middle, high) if elbow_gap(middle) > 0 else (low, middle)
     return np.asarray(FIVE_BAR.sigma(np.array([theta_1, low])), dtype=float)

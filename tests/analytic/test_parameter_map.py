@@ -120,13 +120,13 @@ def check(mechanism: Mechanism, names: Iterable[str]) -> int:
         count += len(slopes)
         for key, base in parameters.all_numbers.items():
             finite = np.isfinite(base)
-            here, near, far = (x[key][finite] for x in (parameters.all_numbers, one, other))
-            difference = (4 * near - far - 3 * here if value == 0 else near - far) / (2 * step)
+            f_0, f_1, f_2 = (x[key][finite] for x in (parameters.all_numbers, one, other))
+            difference = (4 * f_1 - f_2 - 3 * f_0 if value == 0 else f_1 - f_2) / (2 * step)
             slope = slopes.get(key, np.zeros_like(base))[finite]
             size = max(1.0, np.abs(difference).max(initial=0.0))
             assert slope == pytest.approx(difference, abs=1e-7 * size), (name, key)
             there = values[key][0] if key in values else base
-            assert there[finite] == pytest.approx(near, abs=1e-12 * size), (name, key)
+            assert there[finite] == pytest.approx(f_1, abs=1e-12 * size), (name, key)
     return count
 
 

@@ -14,7 +14,7 @@ from tests.conftest import assert_close
 
 
 def tip(model, q):
-    """Where two circles round the elbows meet, the one below them."""
+    """Return the tip: the lower intersection of two circles about the elbows."""
     left, right = model.l[0] * np.exp(1j * q[0]), model.base + model.l[2] * np.exp(1j * q[1])
     way = right - left
     cosine = (abs(way) ** 2 + model.l[1] ** 2 - model.l[3] ** 2) / (2 * abs(way) * model.l[1])
@@ -22,7 +22,7 @@ def tip(model, q):
 
 
 def inverses(model, x):
-    """All (theta_1, theta_3) that put the tip at x + i y."""
+    """Return all (theta_1, theta_3) with the tip at x + i y."""
     angles = []
     for base, l, m in ((0.0, *model.l[:2]), (model.base, *model.l[2:])):
         way = x - base
@@ -59,8 +59,8 @@ def test_point_jacobian_and_its_derivative_match_differences(pair, states):
     mechanism, model = pair
     point, h = Point(mechanism), 1e-4
 
-    def along(q, direction):
-        """First and second derivative of the tip by central differences of fourth order."""
+    def tip_derivatives(q, direction):
+        """Return first and second derivative of the tip by central differences of fourth order."""
         f = [tip(model, q + k * h * direction) for k in (-2, -1, 0, 1, 2)]
         return (f[0] - 8 * f[1] + 8 * f[3] - f[4]) / (12 * h), (-f[0] + 16 * f[1] - 30 * f[2] + 16 * f[3] - f[4]) / (
             12 * h**2
@@ -68,7 +68,7 @@ def test_point_jacobian_and_its_derivative_match_differences(pair, states):
 
     for q, q_dot in zip(states, np.random.default_rng(1).normal(size=(8, 2)), strict=True):
         at = sigma(mechanism, q).at
-        velocity, acceleration = along(q, q_dot)
+        velocity, acceleration = tip_derivatives(q, q_dot)
         assert_close(point.jacobian(at) @ q_dot, [velocity.real, velocity.imag, 0.0], 1e-9)
         assert_close(point.jacobian_dot(at, q_dot) @ q_dot, [acceleration.real, acceleration.imag, 0.0], 1e-5)
 
@@ -78,18 +78,18 @@ def test_inverse_kinematics_finds_four_solutions_and_follows_one_branch(pair, st
     point = Point(mechanism)
     for q in states:
         x = tip(model, q)
-        wanted = inverses(model, x)
-        found = np.array([solution.q for solution in point.every_inverse([x.real, x.imag, 0.0])])
-        assert len(found) == 4
-        for one in wanted:
-            assert np.abs(wrapped(found - one)).max(axis=1).min() < 1e-9
+        expected = inverses(model, x)
+        solutions = np.array([solution.q for solution in point.every_inverse([x.real, x.imag, 0.0])])
+        assert len(solutions) == 4
+        for one in expected:
+            assert np.abs(wrapped(solutions - one)).max(axis=1).min() < 1e-9
         followed = point.inverse([x.real, x.imag, 0.0])
-        assert np.abs(wrapped(wanted - followed.q)).max(axis=1).min() < 1e-9
+        assert np.abs(wrapped(expected - followed.q)).max(axis=1).min() < 1e-9
         assert np.all(np.sign(np.sin(followed.at.q_tree[[1, 3]])) == np.sign(np.sin(mechanism.q_tree[[1, 3]])))
 
 
 def test_inverse_kinematics_of_the_delta_matches_closed_form():
-    """Rods of 0.45 m from elbows on circles of 0.18 m, about hinges 0.25 m out, to balls 0.04 m from the place."""
+    """Hinges are at radius 0.25 m, arms are 0.18 m and rods 0.45 m long; balls are 0.04 m from the plate's point."""
     mechanism = load("delta")
     point = Point(mechanism)
     for place in np.random.default_rng(4).uniform([-0.1, -0.1, -0.35], [0.1, 0.1, -0.25], (5, 3)):
@@ -171,7 +171,7 @@ def test_a_table_of_the_tip(pair):
 
 
 def test_a_path_that_leaves_the_workspace_is_rejected(pair):
-    """Straight down: the tip leaves where both chains are stretched, at a depth that Pythagoras knows."""
+    """The tip moves straight down and leaves the workspace where both chains are stretched."""
     mechanism, model = pair
     down = {"start": [model.base / 2, -0.5, 0.0], "end": [model.base / 2, -0.7, 0.0], "frequency": 1.0}
     follow = path(mechanism, line=down)
@@ -187,7 +187,11 @@ def test_a_path_that_leaves_the_workspace_is_rejected(pair):
     ("name", "desired", "t_end"),
     [
         ("five_bar", {"point": "tip", "circle": CIRCLE}, 3.0),
-        ("five_bar", {"point": "tip", "circle": {**CIRCLE, "frequency": 40.0}}, 3.0),  # a chord is no arc: one by one
+        (
+            "five_bar",
+            {"point": "tip", "circle": {**CIRCLE, "frequency": 40.0}},
+            3.0,
+        ),  # chords are too far from the arc, so knots are solved one by one
         (
             "five_bar",
             {"point": "tip", "line": {"start": [0.1, -0.4, 0], "end": [0.2, -0.45, 0], "frequency": 2.0}},
@@ -198,7 +202,7 @@ def test_a_path_that_leaves_the_workspace_is_rejected(pair):
     ],
 )
 def test_interpolated_knots_equal_the_path(name, desired, t_end):
-    """And each of them puts the point on the path, in closed form."""
+    """At each knot the point is on the closed form of the path."""
     mechanism = load(name)
     follow = make_desired(desired, mechanism, Sources("test", None, {}), t_end)
     together = follow._solve_interpolated()

@@ -122,7 +122,7 @@ def test_sigma_out_of_reach_reports_the_miss(pair: Pair) -> None:
 def test_sigma_converges_close_to_the_outer_singularity(pair: Pair, inside: float) -> None:
     """Type 2: links 2 and 4 all but in line; z is then as the square root of the distance, and sigma finds it."""
     mechanism, reference = pair
-    q = near_type_2(pair, inside)
+    q = q_near_type_2(pair, inside)
     solution = sigma(mechanism, q)
     assert solution.verdict == "converged"
     closed = reference.sigma(q)
@@ -132,7 +132,7 @@ def test_sigma_converges_close_to_the_outer_singularity(pair: Pair, inside: floa
 @pytest.mark.parametrize("outside", [1e-3, 1e-5, 1e-7])
 def test_sigma_just_outside_the_workspace_is_out_of_reach(pair: Pair, outside: float) -> None:
     mechanism, _ = pair
-    assert sigma(mechanism, near_type_2(pair, -outside)).verdict == "out of reach"
+    assert sigma(mechanism, q_near_type_2(pair, -outside)).verdict == "out of reach"
 
 
 def test_coincident_elbows_are_singular(five_bar: Pair) -> None:
@@ -151,16 +151,16 @@ def test_elbows_of_unequal_links_cannot_coincide(pair: Pair) -> None:
         assert sigma(mechanism, coincident_elbows(reference)).verdict == "out of reach"
 
 
-def near_type_2(pair: Pair, inside: float) -> Array:
+def q_near_type_2(pair: Pair, inside: float) -> Array:
     """q on the way outwards from the equilibrium, whose elbows are `inside` metres nearer than l2 + l4."""
     mechanism, reference = pair
     start, direction = mechanism.q_tree[Q], np.array([-1.0, 1.0])
-    near, far = 0.0, 1.5
+    inner, outer = 0.0, 1.5
     for _ in range(100):
-        middle = (near + far) / 2
+        middle = (inner + outer) / 2
         too_far = elbow_distance(reference, start + middle * direction) > reference.l[1] + reference.l[3] - inside
-        near, far = (near, middle) if too_far else (middle, far)
-    return start + near * direction
+        inner, outer = (inner, middle) if too_far else (middle, outer)
+    return start + inner * direction
 
 
 def coincident_elbows(reference: FiveBar) -> Array:

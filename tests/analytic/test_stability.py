@@ -100,13 +100,13 @@ def test_set_point_eigenvalues_match_the_appendix() -> None:
 
 
 @pytest.mark.parametrize("name", ["five_bar/set_point", "talos/squat"])
-def test_the_least_gain_is_the_stability_boundary(name: str) -> None:
+def test_smallest_stable_gain_is_the_stability_boundary(name: str) -> None:
     result = check(name).stability
     assert result is not None
     assert result.least_K_P is not None
-    least = float(result.least_K_P[0, 0])
+    smallest_gain = float(result.least_K_P[0, 0])
     for factor, stable in ((1 + 1e-6, True), (1 - 1e-6, False)):
-        at_boundary = stability(*_with_gain(name, factor * least), 1.0)
+        at_boundary = stability(*_with_gain(name, factor * smallest_gain), 1.0)
         assert at_boundary.eigenvalues is not None
         assert at_boundary.stable == stable
         assert (at_boundary.least_eigenvalue > 0) == stable  # type: ignore[operator]

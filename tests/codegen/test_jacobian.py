@@ -13,7 +13,7 @@ from ckc_pin.codegen.library import compile_terms
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import FIVE_BAR
 from tests.codegen.test_compiled import COUPLED, FREE
-from tests.native.loops import started
+from tests.native.loops import start_loop
 
 STEP = 1e-30  # of a complex step, which has no cancellation
 K_P, K_V = 30.0, 4.0
@@ -28,7 +28,7 @@ def five_bar(formulation: str, controlled: bool) -> Any:
             "K_V": K_V,
             "q_d": {"theta_1": -1.2, "theta_3": -1.6},
         }
-    return started("five_bar/swing", overrides).loop
+    return start_loop("five_bar/swing", overrides).loop
 
 
 def control(controlled: bool, q: Any, q_dot: Any) -> Any:
@@ -115,7 +115,7 @@ def dae(mechanism: str, terms: str, folder: Path) -> Any:
     scene = folder / f"{terms}.scene.toml"
     text = f'mechanism = "{mechanism}"\nformulation = "dae"\nt_end = 1.0\ninitial.at = "assembled"\n'
     scene.write_text(text + f'solver.terms = "{terms}"\n')
-    return started(str(scene)).loop
+    return start_loop(str(scene)).loop
 
 
 @pytest.mark.parametrize("formulation", ["dae", "reduced"])

@@ -17,8 +17,8 @@ PENDULUM = """<robot name="p"><link name="a"/><link name="b"><inertial><mass val
 <joint name="swing" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
 
 
-def _tracking(*changes: str) -> tuple[str, ...]:
-    return ("run", "bar/tracking.scene.toml", *(w for c in changes for w in ("--set", f"controller.{c}")))
+def _tracking(*overrides: str) -> tuple[str, ...]:
+    return ("run", "bar/tracking.scene.toml", *(w for c in overrides for w in ("--set", f"controller.{c}")))
 
 
 def _value(change: str, *says: str) -> Bad:

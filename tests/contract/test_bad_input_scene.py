@@ -14,8 +14,8 @@ GREATER = "greater than 0"
 FINITE = "expected a finite number"
 
 
-def _set(*changes: str) -> tuple[str, ...]:
-    return (*RUN, *(word for change in changes for word in ("--set", change)))
+def _set(*overrides: str) -> tuple[str, ...]:
+    return (*RUN, *(word for change in overrides for word in ("--set", change)))
 
 
 def _value(change: str, *says: str) -> Bad:

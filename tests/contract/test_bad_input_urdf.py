@@ -18,13 +18,13 @@ PENDULUM = """<robot name="p"><link name="a"/><link name="b"><inertial><origin x
 <parent link="a"/><child link="b"/><origin xyz="0 0 0"/><axis xyz="0 0 1"/></joint></robot>"""
 
 
-def _whole(what: str, urdf: str | bytes, *says: str) -> Bad:
+def _complete_urdf(what: str, urdf: str | bytes, *says: str) -> Bad:
     return Bad(what, CHECK, [NAMED, *says], files={**ONE, "bar/five_bar.urdf": urdf})
 
 
 def _pendulum(what: str, old: str, new: str, *says: str) -> Bad:
     assert old in PENDULUM
-    return _whole(what, PENDULUM.replace(old, new, 1), *says)
+    return _complete_urdf(what, PENDULUM.replace(old, new, 1), *says)
 
 
 def _joint(what: str, inside: str, *says: str) -> Bad:
@@ -42,26 +42,30 @@ def _turns(name: str, parent: str, child: str) -> str:
 
 
 XML = [
-    _whole("malformed", "<robot><link></robot>", "malformed XML: mismatched tag: line 1"),
-    _whole("empty", "", "malformed XML: no element found"),
+    _complete_urdf("malformed", "<robot><link></robot>", "malformed XML: mismatched tag: line 1"),
+    _complete_urdf("empty", "", "malformed XML: no element found"),
     Bad("binary", CHECK, ["bar/five_bar.urdf: not a", "not UTF-8"], files={"bar/five_bar.urdf": b"\x00\xff"}),
-    _whole("a control character", '<robot name="\1"/>', "malformed XML"),
-    _whole("a document type", '<!DOCTYPE robot><robot name="a"/>', "document type declaration (robot)"),
-    _whole(
+    _complete_urdf("a control character", '<robot name="\1"/>', "malformed XML"),
+    _complete_urdf("a document type", '<!DOCTYPE robot><robot name="a"/>', "document type declaration (robot)"),
+    _complete_urdf(
         "a billion laughs",
         '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;">]><robot name="&c;"/>',
         "document type declaration (x)",
     ),
-    _whole("another file", '<!DOCTYPE x SYSTEM "file:///etc/hostname"><robot name="a"/>', "document type declaration"),
-    _whole("an unknown entity", '<robot name="&x;"/>', "malformed XML: undefined entity"),
-    _whole("nested without end", "<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>", "nested more than"),
-    _whole("two documents", "<robot/><robot/>", "malformed XML: junk after document element"),
-    _whole("another root", "<mujoco/>", "expected the root element <robot> of a URDF, got <mujoco>"),
+    _complete_urdf(
+        "another file", '<!DOCTYPE x SYSTEM "file:///etc/hostname"><robot name="a"/>', "document type declaration"
+    ),
+    _complete_urdf("an unknown entity", '<robot name="&x;"/>', "malformed XML: undefined entity"),
+    _complete_urdf(
+        "nested without end", "<robot>" + "<a>" * 100_000 + "</a>" * 100_000 + "</robot>", "nested more than"
+    ),
+    _complete_urdf("two documents", "<robot/><robot/>", "malformed XML: junk after document element"),
+    _complete_urdf("another root", "<mujoco/>", "expected the root element <robot> of a URDF, got <mujoco>"),
 ]
 
 TREE = [
-    _whole("nothing in it", '<robot name="a"/>', "no <link>"),
-    _whole("a link without name", "<robot><link/></robot>", "a <link> has no name"),
+    _complete_urdf("nothing in it", '<robot name="a"/>', "no <link>"),
+    _complete_urdf("a link without name", "<robot><link/></robot>", "a <link> has no name"),
     _more("two links of one name", '<link name="a"/>', "two <link> elements are called 'a'"),
     _more("two joints of one name", f'<link name="c"/>{_turns("j", "b", "c")}', "two <joint> elements are called 'j'"),
     _more("two roots", '<link name="c"/>', "a URDF is a tree with one root link; roots found: 'a', 'c'"),
@@ -91,7 +95,7 @@ JOINTS = [
     _pendulum("origin with commas", 'xyz="0 0 0"', 'xyz="0,0,0"', "xyz='0,0,0' is not 3 finite numbers"),
     _pendulum("a number only Python reads", 'xyz="0 0 0"', 'xyz="0 0 1_0"', "xyz='0 0 1_0' is not 3 finite"),
     _pendulum("a number too large", 'xyz="0 0 0"', 'xyz="0 0 1e999"', "xyz='0 0 1e999' is not 3 finite"),
-    _whole(
+    _complete_urdf(
         "limits reversed",
         PENDULUM.replace("continuous", "revolute").replace("</joint>", '<limit lower="1" upper="-1"/></joint>'),
         "joint 'j': its lower limit 1 is above the upper one -1",
@@ -170,7 +174,7 @@ HARMLESS = {
 
 
 @pytest.mark.parametrize("what", HARMLESS)
-def test_what_does_not_matter_to_dynamics_is_no_error(what: str, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_elements_irrelevant_to_dynamics_are_accepted(what: str, bar: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """All the same pendulum: m = 1 kg at 1 m, 1 kg m^2 about its centre of mass."""
     (bar / "mechanism.toml").write_text(ONE["bar/mechanism.toml"], encoding="utf-8")
     (bar / "five_bar.urdf").write_text(HARMLESS[what], encoding="utf-8")

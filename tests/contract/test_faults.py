@@ -1,4 +1,4 @@
-"""What is wrong with a file, as data: every place, what was found there, what would be right."""
+"""Faults of a file as data: path, value, and expected values or type."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def test_all_errors_of_a_file_are_found() -> None:
     data |= {"t_end": -1, "formulation": "ode", "event": [{"of": "v"}, {"coordinat": "theta_1"}]}
     data["controller"] |= {"K_D": [[1.0, "a"], [0.0, 1.0]], "sample_time": True}
     del data["mechanism"]
-    found = {(fault.path, fault.kind): fault for fault in find_faults(data, SceneSpec)}
-    assert set(found) == {
+    faults = {(fault.path, fault.kind): fault for fault in find_faults(data, SceneSpec)}
+    assert set(faults) == {
         (("t_end",), "value"),
         (("formulation",), "value"),
         ((), "missing key"),
@@ -37,22 +37,22 @@ def test_all_errors_of_a_file_are_found() -> None:
         (("controller", "K_D", 0, 1), "value"),
         (("controller", "sample_time"), "value"),
     }
-    assert found[("formulation",), "value"].choices == ("dae", "reduced", "spf")
-    assert found[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop")
-    assert found[("event", 1), "unknown key"].suggestion == "coordinate"
-    assert found[(), "missing key"].value == "mechanism"
-    assert found[("controller", "K_D", 0, 1), "value"].value == "a"
+    assert faults[("formulation",), "value"].choices == ("dae", "reduced", "spf")
+    assert faults[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop")
+    assert faults[("event", 1), "unknown key"].suggestion == "coordinate"
+    assert faults[(), "missing key"].value == "mechanism"
+    assert faults[("controller", "K_D", 0, 1), "value"].value == "a"
 
 
 def test_one_message_names_all_places_and_counts_what_it_leaves_out() -> None:
     data = {"name": "", "gravity": 3, "tree": [{"root": "loose"}], "loop": [{"type": "x"}], "urdf": float("nan")}
     with pytest.raises(InputError) as refused:
         convert(data, MechanismSpec, "m.toml")
-    said = str(refused.value)
-    assert said.startswith("m.toml: (1) name = ''")
+    message = str(refused.value)
+    assert message.startswith("m.toml: (1) name = ''")
     for place in ("(2) urdf", "(3) tree[0]", "'file'", "(4) tree[0].root", "'fixed'", "(5) gravity = 3"):
-        assert place in said
-    assert said.endswith(" and 4 more")  # of the loop: its type, name, frame_a and frame_b
+        assert place in message
+    assert message.endswith(" and 4 more")  # of the loop: its type, name, frame_a and frame_b
 
 
 def test_a_misspelled_key_is_not_also_missing() -> None:
@@ -66,8 +66,8 @@ def test_choices_are_those_of_the_type() -> None:
 
 
 def test_list_entries_with_the_same_error_are_reported_once() -> None:
-    found = [fault.path for fault in find_faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
-    assert found == [("gravity", 0)]
+    faults = [fault.path for fault in find_faults({"gravity": ["a", "b", "c"], "name": "x"}, MechanismSpec)]
+    assert faults == [("gravity", 0)]
 
 
 def test_keys_that_are_not_strings_are_rejected() -> None:
@@ -82,20 +82,22 @@ def test_keys_that_are_not_strings_are_rejected() -> None:
      (MechanismSpec, "flyball/mechanism.toml")],
 )  # fmt: skip
 def test_faults_agree_with_msgspec(kind: Any, file: str) -> None:
-    r, given, refused = random.Random(5), shipped(file), 0
-    if "q_guess" in given:
-        given["q_guess"] = {key: value for key, value in given["q_guess"].items() if not isinstance(value, dict)}
+    r, data_file, refused = random.Random(5), shipped(file), 0
+    if "q_guess" in data_file:
+        data_file["q_guess"] = {
+            key: value for key, value in data_file["q_guess"].items() if not isinstance(value, dict)
+        }
     for _ in range(400):
-        data = mutated(r, mutated(r, given))
+        data = mutated(r, mutated(r, data_file))
         try:
             msgspec.convert(data, kind)
             fits = True
         except msgspec.ValidationError:
             fits = False
-        found = [*find_faults(data, kind)]
-        assert fits == (not found), data
+        faults = [*find_faults(data, kind)]
+        assert fits == (not faults), data
         refused += not fits
-        for fault in found:
+        for fault in faults:
             assert _at(data, fault.path) is fault.value or fault.kind != "value"
             assert fault.expected or fault.choices or fault.kind == "missing key"
     assert 50 < refused < 400

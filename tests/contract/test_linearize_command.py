@@ -1,4 +1,4 @@
-"""ckc linearize: JSON, files, modes that play, errors; the LQR example."""
+"""`ckc linearize`: JSON, files, playback of modes, errors; the LQR example."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ FALLING = """<robot name="falling"><link name="base"/>
 
 
 def test_json_has_labels_and_matrices() -> None:
-    found = ckc("linearize", "five_bar", "--at", "equilibrium", "--json").json
-    assert list(found) == KEYS
+    result = ckc("linearize", "five_bar", "--at", "equilibrium", "--json").json
+    assert list(result) == KEYS
     model = linearize("five_bar")
     for name in "ABCD":
-        assert np.array_equal(found[name], getattr(model, name))
-    assert found["states"] == ["theta_1", "theta_3", "theta_1_dot", "theta_3_dot"]
-    assert found["inputs"] == ["theta_1", "theta_3"]
-    assert [complex(*x) for x in found["eigenvalues"]] == model.eigenvalues.tolist()
-    assert found["at"]["q_tree"] == model.q_tree.tolist()
-    assert found["at"]["t"] is None
-    shape = found["modes"][0]["shape"]
+        assert np.array_equal(result[name], getattr(model, name))
+    assert result["states"] == ["theta_1", "theta_3", "theta_1_dot", "theta_3_dot"]
+    assert result["inputs"] == ["theta_1", "theta_3"]
+    assert [complex(*x) for x in result["eigenvalues"]] == model.eigenvalues.tolist()
+    assert result["at"]["q_tree"] == model.q_tree.tolist()
+    assert result["at"]["t"] is None
+    shape = result["modes"][0]["shape"]
     assert max(abs(complex(*x)) for x in shape.values()) == pytest.approx(1.0)
-    assert found["closed_loop"] is None
+    assert result["closed_loop"] is None
 
 
-def test_an_instant_has_the_closed_loop_beside_the_plant() -> None:
-    found = ckc("linearize", "five_bar/set_point", "--at", "0.5", "--json").json
-    assert found["at"]["t"] == 0.5
-    assert len(found["closed_loop"]["A"]) == 4
-    assert max(re for re, _ in found["closed_loop"]["eigenvalues"]) < 0
-    assert any("plant" in note for note in found["notes"])
+def test_linearization_at_a_time_includes_the_closed_loop() -> None:
+    result = ckc("linearize", "five_bar/set_point", "--at", "0.5", "--json").json
+    assert result["at"]["t"] == 0.5
+    assert len(result["closed_loop"]["A"]) == 4
+    assert max(re for re, _ in result["closed_loop"]["eigenvalues"]) < 0
+    assert any("plant" in note for note in result["notes"])
 
 
-def test_people_read_one_screen() -> None:
+def test_text_output_fits_one_screen() -> None:
     answer = ckc("linearize", "stewart")
     assert answer.code == 0
     assert "1.503 Hz, damping ratio 0" in answer.out
@@ -77,11 +77,11 @@ def test_out_writes_model_figures_and_modes_to_play(tmp_path: Path) -> None:
     assert run.t[-1] == pytest.approx(2 * period)
     assert run.max_phi < 1e-8
     assert np.abs(run.q_tree[0] - run.q_tree[-1]).max() < 1e-12
-    # for small swings it is the shape
+    # small displacements are proportional to the shape
     shape = model.modes[0].shape
-    swing = run.q_tree - model.q_tree
+    displacement = run.q_tree - model.q_tree
     k = int(np.argmax(np.abs(shape)))
-    assert np.ptp(swing[:, k]) == pytest.approx(2 * np.abs(swing[:, k]).max(), rel=0.2)
+    assert np.ptp(displacement[:, k]) == pytest.approx(2 * np.abs(displacement[:, k]).max(), rel=0.2)
     assert ckc("play", str(folder / "mode_1.npz"), "--html", str(tmp_path / "mode.html")).code == 0
 
 
@@ -98,13 +98,13 @@ def test_out_writes_model_figures_and_modes_to_play(tmp_path: Path) -> None:
         (("no_such",), "no mechanism 'no_such'"),
     ],
 )
-def test_what_was_wrong_is_said(line: tuple[str, ...], says: str) -> None:
+def test_invalid_arguments_are_reported(line: tuple[str, ...], says: str) -> None:
     answer = ckc("linearize", *line)
     assert answer.code == 2
     assert says in answer.err
 
 
-def test_no_equilibrium_is_for_the_numerics(tmp_path: Path) -> None:
+def test_missing_equilibrium_exits_with_3(tmp_path: Path) -> None:
     falling = tmp_path / "mechanism.toml"
     falling.write_text('name = "falling"\nurdf = "falling.urdf"\n')
     (tmp_path / "falling.urdf").write_text(FALLING)
@@ -117,21 +117,21 @@ def test_no_equilibrium_is_for_the_numerics(tmp_path: Path) -> None:
 PERIOD = "4.99171151369"  # of bricard/period, which swings to and fro and keeps its energy
 
 
-def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Path) -> None:
-    found = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
-    assert list(found) == ["name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"]
-    assert found["stable"] is None
-    assert found == floquet("bricard/period", float(PERIOD)).to_dict()
-    # one freedom without damping: the area of pushes stays, and one along the motion comes back as it was
-    monodromy = np.array(found["monodromy"])
+def test_floquet_multipliers_equal_those_of_python(tmp_path: Path) -> None:
+    result = ckc("linearize", "bricard/period", "--period", PERIOD, "--json").json
+    assert list(result) == ["name", "states", "period", "monodromy", "multipliers", "stable", "uncertainty"]
+    assert result["stable"] is None
+    assert result == floquet("bricard/period", float(PERIOD)).to_dict()
+    # one freedom without damping: areas in phase space are conserved, and a perturbation along the motion is periodic
+    monodromy = np.array(result["monodromy"])
     assert np.linalg.det(monodromy) == pytest.approx(1.0, abs=1e-7)
-    assert [complex(*x) for x in found["multipliers"]] == pytest.approx([1.0, 1.0], abs=1e-3)
+    assert [complex(*x) for x in result["multipliers"]] == pytest.approx([1.0, 1.0], abs=1e-3)
     folder = tmp_path / "motion"
     answer = ckc("linearize", "bricard/period", "--period", PERIOD, "--out", str(folder))
     assert "neither grow nor decay" in " ".join(answer.out.split())  # wherever its line is broken
     with np.load(folder / "floquet.npz") as file:
         assert np.array_equal(file["monodromy"], monodromy)
-        assert file["states"].tolist() == found["states"]
+        assert file["states"].tolist() == result["states"]
     assert Run.load(folder / "run.npz").t[-1] == float(PERIOD)
 
 
@@ -143,39 +143,39 @@ def test_along_a_period_multipliers_are_printed_as_python_has_them(tmp_path: Pat
         (("bricard/period", "--period", "4", "--at", "2"), "--at and --period are both given"),
     ],
 )
-def test_a_period_that_is_none_is_refused(line: tuple[str, ...], says: str) -> None:
+def test_invalid_periods_are_rejected(line: tuple[str, ...], says: str) -> None:
     answer = ckc("linearize", *line)
     assert answer.code == 2
     assert says in answer.err
 
 
-def test_check_tells_of_the_closed_loop() -> None:
-    found = ckc("check", "talos/squat", "--json").json["stability"]
-    assert found["stable"] is True
-    assert len(found["eigenvalues"]) == 52
-    assert found["leaves_out"] == ["dry friction"]
+def test_check_reports_closed_loop_stability() -> None:
+    result = ckc("check", "talos/squat", "--json").json["stability"]
+    assert result["stable"] is True
+    assert len(result["eigenvalues"]) == 52
+    assert result["leaves_out"] == ["dry friction"]
     assert "stable at its target" in ckc("check", "five_bar/set_point").out
     assert ckc("check", "five_bar", "--json").json["stability"] is None
 
 
-def test_check_says_that_a_verdict_is_that_of_the_samples(tmp_path: Path) -> None:
+def test_check_reports_stability_of_the_sampled_loop(tmp_path: Path) -> None:
     scene = tmp_path / "seldom.scene.toml"
     scene.write_text(
         'mechanism = "five_bar"\nformulation = "reduced"\nt_end = 1.0\ninitial.at = "equilibrium"\n'
         '[controller]\ntype = "set_point"\nK_P = 10.0\nK_V = 1.0\nsample_time = 0.2\ndelay = 0.05\n'
         "q_d = { theta_1 = -1.2, theta_3 = -1.9 }\n"
     )
-    found = ckc("check", str(scene), "--json").json
-    assert found["stability"]["sampled"] is True
-    assert found["stability"]["stable"] is False
-    assert found["stability"]["multiplier"] > 1
-    assert found["stability"]["leaves_out"] == []
-    assert any("unstable as sampled" in warning for warning in found["warnings"])
+    result = ckc("check", str(scene), "--json").json
+    assert result["stability"]["sampled"] is True
+    assert result["stability"]["stable"] is False
+    assert result["stability"]["multiplier"] > 1
+    assert result["stability"]["leaves_out"] == []
+    assert any("unstable as sampled" in warning for warning in result["warnings"])
     assert "UNSTABLE as sampled, factor" in ckc("check", str(scene)).out.replace("\n", " ")
     assert ckc("check", "five_bar/set_point", "--json").json["stability"]["sampled"] is False
 
 
-def test_the_regulator_of_the_example_holds() -> None:
+def test_lqr_example_stabilizes_the_equilibrium() -> None:
     example = runpy.run_path(str(ROOT / "examples" / "lqr.py"))
     model, regulator = example["design"]()
     assert model.eigenvalues.real.max() > 5, "it would fall"
@@ -189,17 +189,17 @@ def test_the_regulator_of_the_example_holds() -> None:
     assert error[-1] < 1e-10
 
 
-def test_the_root_locus_crosses_at_the_least_gain() -> None:
-    locus, found = gain_locus("five_bar/set_point"), check("five_bar/set_point").stability
+def test_root_locus_crosses_the_axis_at_the_smallest_gain() -> None:
+    locus, result = gain_locus("five_bar/set_point"), check("five_bar/set_point").stability
     assert locus is not None
     assert locus.gain == "K_P"
-    assert found is not None
-    assert found.least_K_P is not None
-    least = found.least_K_P[0, 0] / 10.0  # of the scene's K_P
+    assert result is not None
+    assert result.least_K_P is not None
+    smallest_factor = result.least_K_P[0, 0] / 10.0  # of the scene's K_P
     rightmost = locus.eigenvalues.real.max(axis=1)
-    assert np.array_equal(rightmost < 0, locus.factors > least)
-    own = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
-    assert np.abs(np.sort_complex(own) - np.sort_complex(found.eigenvalues)).max() < 1e-6
+    assert np.array_equal(rightmost < 0, locus.factors > smallest_factor)
+    scene_eigenvalues = locus.eigenvalues[int(np.argmin(np.abs(locus.factors - 1)))]
+    assert np.abs(np.sort_complex(scene_eigenvalues) - np.sort_complex(result.eigenvalues)).max() < 1e-6
     assert gain_locus("five_bar") is None
     assert gain_locus("five_bar/swing") is None
 
@@ -222,9 +222,7 @@ def test_figures_show_poles_modes_and_the_locus() -> None:
     assert len(plot(locus)["locus"].axes[0].collections[-1].get_offsets()) == locus.eigenvalues.size
 
 
-def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_period_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bars_of_a_mode_equal_its_animation_at_two_phases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ckc_pin.linear.mode_animation.MAX_AMPLITUDE", 0.01)
     model = linearize(plate_on_springs(tmp_path))  # with dampers, so that not all coordinates are in phase
     figure, animations = plot(model)["modes"], animate_modes(model)
@@ -242,13 +240,13 @@ def test_bars_of_a_mode_are_where_its_run_is_at_an_instant_and_a_quarter_of_a_pe
         frames = [np.argmin(np.abs(run.t - part / model.modes[number - 1].frequency)) for part in (0.0, 0.25)]
         parts = np.array([[bar.get_width() for bar in drawn] for drawn in bars])
         moved = [tree.difference(rest, tree.from_coordinates(run.q_tree[k])) for k in frames]
-        seen = np.array(moved) / tree.step_scale
-        most = np.argmax(np.abs(seen))
-        seen /= seen.flat[most] / parts.flat[most]  # as large as it is shown
-        assert np.abs(seen - parts).max() < 0.05
+        displayed = np.array(moved) / tree.step_scale
+        largest = np.argmax(np.abs(displayed))
+        displayed /= displayed.flat[largest] / parts.flat[largest]  # as large as it is shown
+        assert np.abs(displayed - parts).max() < 0.05
 
 
-def test_a_used_folder_keeps_nothing_of_another_model(tmp_path: Path) -> None:
+def test_output_folder_loses_files_of_another_model(tmp_path: Path) -> None:
     kept = tmp_path / "mode_of_mine.npz"
     kept.write_bytes(b"")
     assert ckc("linearize", "five_bar/set_point", "--at", "target", "--out", str(tmp_path)).code == 0
@@ -260,7 +258,7 @@ def test_a_used_folder_keeps_nothing_of_another_model(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_what_is_not_written_is_said(tmp_path: Path) -> None:
+def test_missing_outputs_are_reported(tmp_path: Path) -> None:
     """Modes that are rigid have no run, and a start out of reach leaves a locus without a branch."""
     assert "0 of 6 modes can be played: rigid modes" in " ".join(
         ckc("linearize", "three_rrr", "--out", str(tmp_path)).out.split()
@@ -273,13 +271,13 @@ def test_what_is_not_written_is_said(tmp_path: Path) -> None:
     assert not (tmp_path / "locus.png").exists()
 
 
-def test_a_run_that_stops_before_is_for_the_numerics() -> None:
+def test_run_that_stops_before_the_instant_exits_with_3() -> None:
     answer = ckc("linearize", "five_bar/swing", "--at", "1.5", "--set", "solver.max_rhs=20", "--json")
     assert answer.code == 3
     assert "ends at t = " in answer.json["message"]
 
 
-def test_an_undamped_mode_has_no_damping_ratio_of_rounding() -> None:
+def test_damping_ratio_of_an_undamped_mode_is_zero() -> None:
     model = linearize("stewart")
     assert model.modes[0].description == "1.503 Hz, damping ratio 0"
     run = model.animate_mode(1)
@@ -287,7 +285,7 @@ def test_an_undamped_mode_has_no_damping_ratio_of_rounding() -> None:
     assert run.scene_name == "stewart: mode 1, 1.503 Hz", "a run of it has none"
 
 
-def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
+def test_mode_animations_of_the_stewart_platform_keep_its_loops_closed() -> None:
     model = linearize("stewart")
     runs = animate_modes(model)
     assert list(runs) == [1, 2, 3, 4, 5, 6]
@@ -297,7 +295,7 @@ def test_a_mode_of_the_stewart_platform_sways_with_its_loops_closed() -> None:
         assert run.max_phi_dot < 1e-9
         assert run.t[-1] == pytest.approx(2 / mode.frequency)
         # the rates are those of the motion, by differences around the ring of frames, to the size of a swing squared
-        most = int(np.argmax(np.abs(mode.shape)))  # pairs of modes share a frequency, and any mixture is one
-        swing, rates = run.q_tree[:49, most], run.v_tree[:48, most]
-        slope = (np.roll(swing[:48], -1) - np.roll(swing[:48], 1)) / (2 * run.t[1])
+        largest = int(np.argmax(np.abs(mode.shape)))  # pairs of modes share a frequency, and any mixture is one
+        displacement, rates = run.q_tree[:49, largest], run.v_tree[:48, largest]
+        slope = (np.roll(displacement[:48], -1) - np.roll(displacement[:48], 1)) / (2 * run.t[1])
         assert np.abs(slope - rates).max() <= 0.2 * np.abs(rates).max()

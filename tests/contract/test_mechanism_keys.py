@@ -73,7 +73,7 @@ def test_constant_torque_is_a_force_with_a_potential(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["force", "spring"])
-def test_what_acts_on_a_joint_needs_one_of_one_freedom(tmp_path: Path, key: str) -> None:
+def test_joint_forces_need_joints_with_one_freedom(tmp_path: Path, key: str) -> None:
     extra = {"force": "value = 1.0", "spring": "stiffness = 1.0"}[key]
     write(tmp_path, "free", "turn = 0.0", f'[[{key}]]\njoint = "root.rx"\n{extra}\n')
     with pytest.raises(MechanismError, match=f"{key} 1: no joint of one freedom called 'root.rx'; there are turn"):

@@ -1,4 +1,4 @@
-"""What `ckc sensitivities` promises: keys and shapes, the summary, files, how it ends, and what it refuses."""
+"""`ckc sensitivities`: JSON keys and shapes, summary, files, exit codes, and invalid arguments."""
 
 from __future__ import annotations
 
@@ -14,44 +14,44 @@ from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
 
 SCENE, NAMES = "five_bar/set_point", ("controller.K_P", "joint.theta_2.xyz.x", "gravity")
-SHORT = ("--set", "t_end=0.2")
+SHORT_RUN = ("--set", "t_end=0.2")
 
 
-def test_json() -> None:
-    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT, "--json")
+def test_json_has_the_documented_keys_and_shapes() -> None:
+    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT_RUN, "--json")
     assert (answer.code, answer.err) == (0, "")
-    found = answer.json
-    m, p = len(found["t"]), 5
-    assert found["parameters"] == [*NAMES[:2], "gravity.x", "gravity.y", "gravity.z"]
+    result = answer.json
+    m, p = len(result["t"]), 5
+    assert result["parameters"] == [*NAMES[:2], "gravity.x", "gravity.y", "gravity.z"]
     for key, width in (("q_tree", 4), ("v_tree", 4), ("u", 2), ("tau", 2)):
-        assert np.shape(found[key]) == (m, width, p)
-    assert {name: np.shape(x) for name, x in found["points"].items()} == {"tip": (m, 3, p)}
-    assert (found["status"], found["end_time"]) == ("done", None)
+        assert np.shape(result[key]) == (m, width, p)
+    assert {name: np.shape(x) for name, x in result["points"].items()} == {"tip": (m, 3, p)}
+    assert (result["status"], result["end_time"]) == ("done", None)
     page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith("| `sensitivities`"))
-    assert [key for key in found if not re.search(rf"\b{key}\b", row)] == []
+    assert [key for key in result if not re.search(rf"\b{key}\b", row)] == []
 
 
-def test_card_and_files(tmp_path: Path) -> None:
-    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT, "--out", str(tmp_path / "x"), "--figures")
+def test_summary_and_files(tmp_path: Path) -> None:
+    answer = ckc("sensitivities", SCENE, *NAMES, *SHORT_RUN, "--out", str(tmp_path / "x"), "--figures")
     assert answer.code == 0
-    found = ckc_pin.sensitivities(SCENE, NAMES, {"t_end": 0.2})
-    most = np.abs(found.of("theta_3", "controller.K_P")).max()
-    assert f"theta_3 = {most:.4g} rad/(N m/rad)" in " ".join(answer.out.split())
-    assert repr(found).splitlines()[0] == "Sensitivities of five_bar/set_point, done: reached t_end"
+    result = ckc_pin.sensitivities(SCENE, NAMES, {"t_end": 0.2})
+    largest = np.abs(result.of("theta_3", "controller.K_P")).max()
+    assert f"theta_3 = {largest:.4g} rad/(N m/rad)" in " ".join(answer.out.split())
+    assert repr(result).splitlines()[0] == "Sensitivities of five_bar/set_point, done: reached t_end"
     assert {path.name for path in (tmp_path / "x").iterdir()} == {"run.npz", "sensitivities.npz", "sensitivities.png"}
     with np.load(tmp_path / "x" / "sensitivities.npz", allow_pickle=False) as data:
-        assert list(data["parameters"]) == list(found.parameters)
+        assert list(data["parameters"]) == list(result.parameters)
         for name in ("t", "q_tree", "v_tree", "u", "tau"):
-            assert np.array_equal(data[name], getattr(found, name))
-        assert np.array_equal(data["point_moved"][:, 0], found.points["tip"])
+            assert np.array_equal(data[name], getattr(result, name))
+        assert np.array_equal(data["point_moved"][:, 0], result.points["tip"])
         assert json.loads(bytes(data["meta"]))["status"] == "done"
         page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "run_file.md").read_text(encoding="utf-8")
-        says = page.partition("## sensitivities.npz")[2].partition("##")[0]
-        assert [key for key in data if not re.search(rf"\b{key}\b", says)] == []
+        section = page.partition("## sensitivities.npz")[2].partition("##")[0]
+        assert [key for key in data if not re.search(rf"\b{key}\b", section)] == []
 
 
-def test_a_motion_without_a_derivative_keeps_what_it_has(tmp_path: Path) -> None:
+def test_run_without_derivative_saves_results_before_it(tmp_path: Path) -> None:
     answer = ckc(
         "sensitivities", "five_bar/friction", "initial.q_dot.theta_1", "--set", "initial.q_dot.theta_1=0",
         "--set", "joint.theta_1.friction=1e-3", "--out", str(tmp_path),

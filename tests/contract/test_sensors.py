@@ -277,7 +277,7 @@ def test_noise_is_normal_and_reproducible() -> None:
     assert np.abs(result - noise(4)).max() > 1.0
 
 
-def test_empty_sensor_table_has_no_effect() -> None:
+def test_empty_sensor_table_is_ignored() -> None:
     """An empty table gives the same results with the same number of right-hand sides."""
     overrides = {"t_end": 0.02, "controller.sample_time": 0.001}
     plain = simulate("five_bar/set_point", overrides)

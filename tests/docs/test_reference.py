@@ -52,7 +52,7 @@ def test_every_number_has_a_unit(file: str, table: keys.Table) -> None:
     ] == []
 
 
-def test_what_a_key_lacks_is_seen() -> None:
+def test_missing_keys_are_detected() -> None:
     class Spec(msgspec.Struct):
         """A table.
 
@@ -108,8 +108,8 @@ def test_every_loop_type_has_its_rows() -> None:
 
 
 def test_every_json_key_array_and_error_is_named() -> None:
-    wanted = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS, "linearize": " ".join(KEYS)}
-    for name, named in wanted.items():
+    expected = {"check": CHECK, "terms": TERMS, "run": RUN, "stats": STATS, "linearize": " ".join(KEYS)}
+    for name, named in expected.items():
         row = next(line for line in page("reference/json.md").splitlines() if line.startswith(f"| `{name}`"))
         assert [key for key in named.split() if not re.search(rf"\b{key}\b", row)] == []
     file = page("reference/run_file.md").partition("## run.npz")[2].partition("##")[0]

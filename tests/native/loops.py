@@ -1,4 +1,4 @@
-"""A scene's loop at its start, and the same motion as the NumPy reference has it."""
+"""A scene's native loop at its start, and the NumPy reference of its right-hand side."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ckc_pin.run.ivp import Ivp, as_ivp
 from ckc_pin.run.prepare import Prepared, prepare
 
 
-def started(scene: str, overrides: dict[str, Any] | None = None) -> Prepared:
+def start_loop(scene: str, overrides: dict[str, Any] | None = None) -> Prepared:
     """Return a scene with its loop at the start."""
     ready = prepare(load_scene(scene, overrides))
     ready.begin()
     return ready
 
 
-def both(scene: str, overrides: dict[str, Any] | None = None) -> tuple[Prepared, Ivp]:
-    """Return a scene with its loop at the start, and its motion in NumPy."""
-    return started(scene, overrides), as_ivp(scene, overrides)
+def start_loop_and_ivp(scene: str, overrides: dict[str, Any] | None = None) -> tuple[Prepared, Ivp]:
+    """Return a scene with its loop at the start, and its initial value problem in NumPy."""
+    return start_loop(scene, overrides), as_ivp(scene, overrides)

@@ -1,4 +1,4 @@
-"""Where J nearly or really loses rank: the monitor, and collocation steps across."""
+"""Losses of rank of J: the monitor of the smallest singular value, and collocation steps across them."""
 
 import subprocess
 import sys
@@ -8,10 +8,10 @@ import pytest
 
 from ckc_pin import simulate
 from ckc_pin.mechanism.rank import jacobian_scales
-from tests.native.loops import started
+from tests.native.loops import start_loop
 from tests.regression.test_reference_cases import first_top_pin
 
-T_END = 3.0  # with three positions where the rods lie flat
+T_END = 3.0  # s: the rods lie flat three times
 
 
 def _row_of_squares(N, rtol, **overrides):
@@ -20,34 +20,34 @@ def _row_of_squares(N, rtol, **overrides):
 
 
 @pytest.mark.parametrize(("N", "rtol"), [(1, 1e-7), (2, 1e-9), (5, 1e-11), (20, 1e-8)])
-def test_crossings_are_passed_on_the_right_branch(N, rtol):
+def test_run_stays_on_its_branch_at_losses_of_rank(N, rtol):
     run = _row_of_squares(N, rtol)
     assert run.status == "done", run.message
     assert run.max_phi < 1e-11
-    wanted = [first_top_pin(N, t) for t in run.t]
-    assert np.abs(run.points["B0"][:, :2] - wanted).max() < 200 * rtol
+    expected = [first_top_pin(N, t) for t in run.t]
+    assert np.abs(run.points["B0"][:, :2] - expected).max() < 200 * rtol
 
 
-def test_a_coarse_run_is_made_again_to_the_first_crossing():
-    """With an error of 1e-4 there, the branches could not be told apart later."""
+def test_coarse_run_is_repeated_up_to_the_first_crossing():
+    """An error of 1e-4 at the first crossing would make the branches indistinguishable later."""
     run = _row_of_squares(3, 1e-4)
     assert run.status == "done", run.message
-    wanted = [first_top_pin(3, t) for t in run.t]
-    assert np.abs(run.points["B0"][:, :2] - wanted).max() < 1e-5
+    expected = [first_top_pin(3, t) for t in run.t]
+    assert np.abs(run.points["B0"][:, :2] - expected).max() < 1e-5
 
 
-def test_a_budget_ends_a_run_with_crossings_where_it_is_used_up():
-    whole = _row_of_squares(2, 1e-8)
-    cut = _row_of_squares(2, 1e-8, **{"solver.max_rhs": whole.stats["rhs"] - 50})
-    assert cut.status == "stopped"
-    assert "max_rhs" in cut.message
-    assert cut.stats["rhs"] <= whole.stats["rhs"] - 50
-    assert 0.5 * T_END < cut.t[-1] < T_END
+def test_run_with_crossings_stops_at_its_budget():
+    complete = _row_of_squares(2, 1e-8)
+    limited = _row_of_squares(2, 1e-8, **{"solver.max_rhs": complete.stats["rhs"] - 50})
+    assert limited.status == "stopped"
+    assert "max_rhs" in limited.message
+    assert limited.stats["rhs"] <= complete.stats["rhs"] - 50
+    assert 0.5 * T_END < limited.t[-1] < T_END
 
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-7, 1e-10])
-def test_positions_that_only_come_near_are_passed_in_ordinary_steps(rtol):
-    """Two arms on a bar come near a loss of rank several times in two seconds; the reduced model watches nothing."""
+def test_run_passes_close_to_losses_of_rank(rtol):
+    """Two arms on a bar come close to a loss of rank several times. The reduced model does not monitor the rank."""
     overrides = {"t_end": 0.8, "solver.rtol": rtol, "solver.output_dt": 0.1}
     run = simulate("two_ur5", overrides)
     assert run.status == "done", run.message
@@ -55,8 +55,8 @@ def test_positions_that_only_come_near_are_passed_in_ordinary_steps(rtol):
     assert np.abs(run.q_tree - reduced.q_tree).max() < 1e3 * rtol
 
 
-def test_nothing_of_the_native_core_is_left_when_python_ends():
-    """Kept alive by a module of the caller's, which is what the report's libraries do."""
+def test_native_core_leaks_nothing_when_python_exits():
+    """A user's module may keep a reference to the core."""
     program = (
         "import ctypes, ckc_pin\n"
         "from ckc_pin.native import _core\n"
@@ -69,9 +69,9 @@ def test_nothing_of_the_native_core_is_left_when_python_ends():
 
 
 @pytest.mark.parametrize("N", [3, 9, 30, 120])
-def test_the_least_singular_value_that_is_monitored_is_that_of_j(N):
-    """Of chains whose J is decomposed whole and of longer ones, against NumPy's and differences of NumPy's."""
-    ready = started("n_four_bar", {"mechanism.N": N})
+def test_monitored_singular_value_is_the_smallest_of_J(N):
+    """Value and rate agree with NumPy, for chains whose J is decomposed as a dense matrix and for longer ones."""
+    ready = start_loop("n_four_bar", {"mechanism.N": N})
     mechanism = ready.mechanism
     rows, columns = jacobian_scales(mechanism.tree, mechanism.closure)
 
@@ -80,7 +80,7 @@ def test_the_least_singular_value_that_is_monitored_is_that_of_j(N):
         return np.linalg.svd(rows[:, None] * J * columns, compute_uv=False)
 
     rng = np.random.default_rng(N)
-    for _ in range(5):  # off the closure, where the loops are as different as can be
+    for _ in range(5):  # off the constraint manifold the loops are all different
         start, v_tree = rng.uniform(-3, 3, mechanism.n), rng.normal(size=mechanism.n)
         value, rate = ready.loop.rank(np.concatenate([start, v_tree]))
         values, h = singular_values(0.0), 1e-6

@@ -30,7 +30,7 @@ from tests.property.worlds import Numbers, World, random_world, rotation, slope
 RowsIn = Literal["a", "world"]
 
 LENGTH = 0.4  # of a distance loop
-LARGEST_RHO, LEAST_SIGMA = 10.0, 0.05  # nearer to a singular phi_z differences lose their digits
+MAX_RHO, MIN_SIGMA = 10.0, 0.05  # differences are inaccurate closer to a singular phi_z
 SPRINGS = [
     SpringSpec(joint="a_j4", rest=0.3, stiffness=5.0, damping=0.2),
     SpringSpec(joint="b_j2", rest=-0.1, stiffness=20.0),
@@ -56,23 +56,23 @@ class Closed:
 
     @property
     def regular(self) -> bool:
-        """Whether the assembled configuration is far from singular."""
+        """Whether the assembled configuration is not close to singular."""
         at = self.mechanism.assembled
-        return bool(np.abs(at.rho).max() < LARGEST_RHO / 2 and at.sigma_min() > 2 * LEAST_SIGMA)
+        return bool(np.abs(at.rho).max() < MAX_RHO / 2 and at.sigma_min() > 2 * MIN_SIGMA)
 
-    def near(self, spread: float = 0.1) -> Terms:
+    def random_state(self, spread: float = 0.1) -> Terms:
         """Return a random state with closed loops near the assembled configuration."""
         random, mechanism = self.world.random, self.mechanism
         at = mechanism.assembled
         while spread > 1e-3:
             step = at.rho @ random.uniform(-spread, spread, mechanism.d)
-            found = sigma(mechanism, mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
-            near = np.abs(found.at.rho).max() < LARGEST_RHO and found.at.sigma_min() > LEAST_SIGMA
-            if found.verdict == "converged" and near:
-                v_tree = found.at.rho @ random.uniform(-1, 1, mechanism.d)
-                return Terms(mechanism, found.at, v_tree / max(1.0, np.abs(v_tree).max()))
+            solution = sigma(mechanism, mechanism.independent_part(mechanism.tree.integrate(mechanism.q_tree, step)))
+            is_regular = np.abs(solution.at.rho).max() < MAX_RHO and solution.at.sigma_min() > MIN_SIGMA
+            if solution.verdict == "converged" and is_regular:
+                v_tree = solution.at.rho @ random.uniform(-1, 1, mechanism.d)
+                return Terms(mechanism, solution.at, v_tree / max(1.0, np.abs(v_tree).max()))
             spread /= 2
-        raise AssertionError(f"no regular configuration near the assembled one: {found}")
+        raise AssertionError(f"no regular configuration near the assembled one: {solution}")
 
     def u_tree(self) -> Array:
         """Return random generalized forces on the tree."""
@@ -88,7 +88,7 @@ def closed_mechanism(
     turn: Array | None = None,
     rows_in: RowsIn = "a",
 ) -> Closed:
-    """Return a world with a loop between the links a_3 and b_3, a coupling, springs, dampers and rotors.
+    """Return a mechanism with a loop between the links a_3 and b_3, a coupling, springs, dampers and rotors.
 
     Parameters
     ----------
@@ -110,13 +110,13 @@ def closed_mechanism(
                  xyz=_triple(turn @ xyz), rpy=_triple(roll_pitch_yaw(turn @ rotation(rpy))))
         for prefix, (xyz, rpy) in world.stands.items()
     ]  # fmt: skip
-    again = [LoopSpec(**{name: getattr(loop, name) for name in loop.__struct_fields__} | {"name": "again"})]
+    duplicate = [LoopSpec(**{name: getattr(loop, name) for name in loop.__struct_fields__} | {"name": "again"})]
     spec = MechanismSpec(
         name=kind,
         tree=trees,
         gravity=_triple(turn @ world.gravity),
         q_guess=q,
-        loop=[loop, *(again if redundant else [])],
+        loop=[loop, *(duplicate if redundant else [])],
         coupling=[CouplingSpec(joint="a_j1", other="b_j4", ratio=0.7, offset=q["a_j1"] - 0.7 * q["b_j4"])],
         spring=SPRINGS,
         joint=ROTORS,
@@ -128,24 +128,24 @@ def closed_mechanism(
 def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> LoopSpec:
     """Return a loop that is closed at q."""
     random = world.random
-    inside, axis = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
-    across = np.cross(axis, random.normal(size=3))
+    xyz_a, axis = random.uniform(-0.3, 0.3, 3), random.normal(size=3)
+    normal = np.cross(axis, random.normal(size=3))
     placement_a, placement_b = world.placement("a_3", q), world.placement("b_3", q)
-    offset = LENGTH * across / np.linalg.norm(across) if kind == "distance" else np.zeros(3)
-    xyz, rpy = closing_frame(placement_a, placement_b, inside + offset)
+    offset = LENGTH * normal / np.linalg.norm(normal) if kind == "distance" else np.zeros(3)
+    xyz, rpy = closing_frame(placement_a, placement_b, xyz_a + offset)
     return LoopSpec(
         name="loop",
         type=kind,
-        frame_a=FrameSpec(link="a_3", xyz=_triple(inside)),
+        frame_a=FrameSpec(link="a_3", xyz=_triple(xyz_a)),
         frame_b=FrameSpec(link="b_3", xyz=_triple(xyz), rpy=_triple(rpy)),
         rows_in=rows_in,
         axis_a=_triple(axis),
-        axis_b=_triple(across if kind == "universal" else axis),
+        axis_b=_triple(normal if kind == "universal" else axis),
         length=LENGTH if kind == "distance" else None,
     )
 
 
-def along(mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array]) -> Array:
+def differentiate_along(mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array]) -> Array:
     """Return the derivative of f(q') along a tangent velocity, by differences."""
     return slope(lambda t: f(mechanism.tree.integrate(q_tree, t * v_tree)))
 

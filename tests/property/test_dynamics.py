@@ -1,4 +1,4 @@
-"""What the terms and the formulations of any closed mechanism obey, whatever its loop: random spatial mechanisms."""
+"""Properties of the terms and formulations of random spatial mechanisms with all types of loops."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ckc_pin.mechanism import Kinematics
 from ckc_pin.mechanism.configuration import Partition
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
-from tests.property.mechanisms import ROTORS, Closed, along, closed_mechanism
+from tests.property.mechanisms import ROTORS, Closed, closed_mechanism, differentiate_along
 from tests.property.strategies import TYPES, angles, seeds
 from tests.property.worlds import rotation, slope
 
@@ -26,7 +26,7 @@ many = settings(max_examples=25)
 @many
 @given(every_mechanism)
 def test_energy_is_the_sum_over_bodies(closed: Closed) -> None:
-    """1/2 v D' v + V against a sum over bodies that are placed in numpy, and over rotors."""
+    """1/2 v D' v + V equals a sum over bodies placed with NumPy, and over rotors."""
     mechanism, world = closed.mechanism, closed.world
     q, v = world.configuration(), world.velocity()
     q_tree, v_tree = (np.array([x[name] for name in mechanism.coordinates]) for x in (q, v))
@@ -38,7 +38,7 @@ def test_energy_is_the_sum_over_bodies(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_rho_spans_the_null_space_of_J(closed: Closed) -> None:
-    mechanism, at = closed.mechanism, closed.near().at
+    mechanism, at = closed.mechanism, closed.random_state().at
     rank = np.linalg.matrix_rank(at.J, tol=1e-8)
     assert at.rho.shape == (mechanism.n, mechanism.n - rank)
     assert_close(at.rho[mechanism.partition.q], np.eye(mechanism.d), 0)
@@ -48,7 +48,7 @@ def test_rho_spans_the_null_space_of_J(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
-    at = closed.near().at
+    at = closed.random_state().at
     again = sigma(closed.mechanism, closed.mechanism.independent_part(at.q_tree))
     assert again.verdict == "converged"
     assert_close(at.phi, 0, closed.mechanism.tolerance)
@@ -58,8 +58,10 @@ def test_sigma_closes_the_loops_at_q(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_rho_dot_is_the_derivative_of_rho(closed: Closed) -> None:
-    terms = closed.near()
-    rho_dot = along(closed.mechanism, terms.q_tree, terms.v_tree, lambda q: closed.mechanism.kinematics(q).rho)
+    terms = closed.random_state()
+    rho_dot = differentiate_along(
+        closed.mechanism, terms.q_tree, terms.v_tree, lambda q: closed.mechanism.kinematics(q).rho
+    )
     assert_close(terms.rho_dot, rho_dot, 1e-8 * max(1, np.abs(rho_dot).max()))
     assert_close(terms.rho_dot_times(terms.q_dot), terms.rho_dot @ terms.q_dot, 1e-12 * max(1, np.abs(rho_dot).max()))
 
@@ -67,13 +69,13 @@ def test_rho_dot_is_the_derivative_of_rho(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_D_dot_minus_two_C_is_skew(closed: Closed) -> None:
-    """Eq. 19 needs it."""
-    terms, mechanism = closed.near(), closed.mechanism
+    """Eq. 19 uses this property."""
+    terms, mechanism = closed.random_state(), closed.mechanism
 
     def D(q_tree: Array) -> Array:
         return Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).D
 
-    skew = along(mechanism, terms.q_tree, terms.v_tree, D) - 2 * terms.C
+    skew = differentiate_along(mechanism, terms.q_tree, terms.v_tree, D) - 2 * terms.C
     assert_close(skew, -skew.T, 1e-8 * max(1, np.abs(terms.C).max()))
     assert_close(terms.C_times(terms.q_dot), terms.C @ terms.q_dot, 1e-12 * max(1, np.abs(terms.C).max()))
 
@@ -81,7 +83,7 @@ def test_D_dot_minus_two_C_is_skew(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_D_is_symmetric_positive_definite(closed: Closed) -> None:
-    terms = closed.near()
+    terms = closed.random_state()
     assert_close(terms.D, terms.D.T, 1e-13, relative=True)
     assert np.linalg.eigvalsh(terms.D)[0] > 0
 
@@ -89,20 +91,20 @@ def test_D_is_symmetric_positive_definite(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_bias_is_C_v_plus_h(closed: Closed) -> None:
-    terms = closed.near()
+    terms = closed.random_state()
     assert_close(terms.bias_tree, terms.C_tree @ terms.v_tree + terms.h_tree, 1e-11)
 
 
 @many
 @given(every_mechanism)
 def test_h_is_the_gradient_of_the_potential(closed: Closed) -> None:
-    """Gravity and springs, along each column of rho."""
-    terms, mechanism = closed.near(), closed.mechanism
+    """For gravity and springs, in the direction of each column of rho."""
+    terms, mechanism = closed.random_state(), closed.mechanism
 
     def V(q_tree: Array) -> Array:
         return np.array(Terms(mechanism, mechanism.kinematics(q_tree), terms.v_tree).potential_energy)
 
-    slopes = [along(mechanism, terms.q_tree, column, V) for column in terms.rho.T]
+    slopes = [differentiate_along(mechanism, terms.q_tree, column, V) for column in terms.rho.T]
     assert_close(terms.h, slopes, 1e-9 * max(1, np.abs(terms.h).max()))
 
 
@@ -110,7 +112,7 @@ def test_h_is_the_gradient_of_the_potential(closed: Closed) -> None:
 @given(every_mechanism)
 def test_dae_is_the_reduced_model(closed: Closed) -> None:
     """J a + J_dot v = 0, and a = rho q_ddot + rho_dot q_dot with eq. 6's q_ddot."""
-    terms, u_tree = closed.near(), closed.u_tree()
+    terms, u_tree = closed.random_state(), closed.u_tree()
     a = dae_acceleration(terms, u_tree)
     size = max(1, np.abs(a).max())
     assert_close(terms.at.J @ a + terms.J_dot @ terms.v_tree, 0, 1e-12 * size)
@@ -122,7 +124,7 @@ def test_dae_is_the_reduced_model(closed: Closed) -> None:
 @given(every_mechanism)
 def test_eq_6_with_and_without_C_agree_on_the_manifold(closed: Closed) -> None:
     """Without the matrix C', and with it at a given q_dot."""
-    terms, u_tree = closed.near(), closed.u_tree()
+    terms, u_tree = closed.random_state(), closed.u_tree()
     q_ddot = reduced_acceleration(terms, u_tree)
     assert_close(reduced_acceleration(terms, u_tree, terms.q_dot), q_ddot, 1e-11 * max(1, np.abs(q_ddot).max()))
 
@@ -130,18 +132,18 @@ def test_eq_6_with_and_without_C_agree_on_the_manifold(closed: Closed) -> None:
 @many
 @given(every_mechanism)
 def test_multipliers_satisfy_eq_1(closed: Closed) -> None:
-    terms, u_tree = closed.near(), closed.u_tree()
+    terms, u_tree = closed.random_state(), closed.u_tree()
     a = dae_acceleration(terms, u_tree)
     force = terms.at.J.T @ multipliers(terms, u_tree, a)
-    left = terms.D_tree @ a + terms.C_tree @ terms.v_tree + terms.h_tree
-    assert_close(left, u_tree + terms.damping_force + force, 1e-11 * max(1, np.abs(left).max()))
+    forces = terms.D_tree @ a + terms.C_tree @ terms.v_tree + terms.h_tree
+    assert_close(forces, u_tree + terms.damping_force + force, 1e-11 * max(1, np.abs(forces).max()))
 
 
 @many
 @given(every_mechanism)
 def test_energy_changes_by_the_power_of_actuators_and_dampers(closed: Closed) -> None:
-    """The loops do no work."""
-    terms, u_tree, mechanism = closed.near(), closed.u_tree(), closed.mechanism
+    """Loops do no work."""
+    terms, u_tree, mechanism = closed.random_state(), closed.u_tree(), closed.mechanism
     a = dae_acceleration(terms, u_tree)
 
     def energy(t: float) -> Array:
@@ -155,16 +157,16 @@ def test_energy_changes_by_the_power_of_actuators_and_dampers(closed: Closed) ->
 @many
 @given(every_mechanism)
 def test_dampers_dissipate(closed: Closed) -> None:
-    terms = closed.near()
+    terms = closed.random_state()
     assert terms.v_tree @ terms.damping_force < 0
 
 
 @many
 @given(every_mechanism)
 def test_the_motion_does_not_depend_on_the_choice_of_q(closed: Closed) -> None:
-    """Any regular split gives the same acceleration of the tree, and D congruent by d q / d q_other."""
-    terms, u_tree, mechanism = closed.near(), closed.u_tree(), closed.mechanism
-    assume(np.abs(terms.rho[mechanism.partition.z]).max() > 0.2)  # else no other coordinate will do
+    """Any regular partition gives the same tree acceleration, and D congruent by d q_other / d q."""
+    terms, u_tree, mechanism = closed.random_state(), closed.u_tree(), closed.mechanism
+    assume(np.abs(terms.rho[mechanism.partition.z]).max() > 0.2)  # otherwise no other coordinate can be independent
     other = other_partition(terms.at)
     at = Kinematics(mechanism.tree, mechanism.closure, other, terms.q_tree)
     theirs = Terms(mechanism, at, terms.v_tree)
@@ -176,7 +178,7 @@ def test_the_motion_does_not_depend_on_the_choice_of_q(closed: Closed) -> None:
 
 
 def other_partition(at: Kinematics) -> Partition:
-    """A split that exchanges one independent coordinate with a dependent one, where that is least singular."""
+    """Return a partition with one independent and one dependent coordinate exchanged, the most regular one."""
     q, z, rho_z = at.partition.q.copy(), at.partition.z.copy(), np.abs(at.rho[at.partition.z])
     row, column = np.unravel_index(np.argmin(np.abs(np.log(np.maximum(rho_z, 1e-300)))), rho_z.shape)
     q[column], z[row] = z[row], q[column]
@@ -187,10 +189,11 @@ def other_partition(at: Kinematics) -> Partition:
 def test_dynamics_do_not_depend_on_the_orientation_of_the_world(
     kind: str, seed: int, rpy: tuple[float, float, float], free: bool
 ) -> None:
-    """Everything turned, gravity too: the same phi and J in frame A's axes, the same D', C', h' and motion."""
+    """A rotation of everything, gravity included, does not change phi and J in frame A's axes, D', C', h' and motion."""
     one = closed_mechanism(kind, seed, free=free)  # type: ignore[arg-type]
+    assume(one.regular)
     two = closed_mechanism(kind, seed, free=free, turn=rotation(np.array(rpy)))  # type: ignore[arg-type]
-    ours = one.near()
+    ours = one.random_state()
     theirs = Terms(two.mechanism, two.mechanism.kinematics(ours.q_tree), ours.v_tree)
     u_tree = one.u_tree()
     for name in ("D_tree", "C_tree", "h_tree", "J_dot", "energy"):
@@ -204,8 +207,8 @@ def test_dynamics_do_not_depend_on_the_orientation_of_the_world(
 @many
 @given(every_mechanism)
 def test_tangent_basis_spans_the_null_space_of_J(closed: Closed) -> None:
-    """What J annihilates, one freedom each and none large; the particular part takes up J_dot v."""
-    terms = closed.near()
+    """Each basis vector has one freedom and no large entry; the particular solution satisfies J x = -J_dot v."""
+    terms = closed.random_state()
     tangent, particular = tangent_basis(terms, terms.J_dot @ terms.v_tree)
     free = [
         int(np.flatnonzero((tangent == np.eye(closed.mechanism.d)[k]).all(axis=1))[0])
@@ -222,7 +225,7 @@ def test_tangent_basis_spans_the_null_space_of_J(closed: Closed) -> None:
 @settings(max_examples=30)
 @given(every_mechanism.filter(lambda closed: not closed.world.free))
 def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None:
-    mechanism, at = closed.mechanism, closed.near().at
+    mechanism, at = closed.mechanism, closed.random_state().at
     q = mechanism.independent_part(at.q_tree)
 
     def h(x: Array) -> Array:
@@ -238,7 +241,7 @@ def test_h_gradient_is_the_hessian_of_the_potential_in_q(closed: Closed) -> None
 
 @pytest.mark.parametrize("redundant", [False, True])
 def test_rows_of_a_loop_closed_twice_are_redundant(redundant: bool) -> None:
-    """The freedoms do not change, and the superfluous rows are as many as the loop has."""
+    """The number of freedoms does not change, and all rows of the second loop are redundant."""
     closed = closed_mechanism("hinge", 1, redundant=redundant)
     assert (closed.mechanism.d, closed.mechanism.rank) == (14 - 6, 6)
     assert len(closed.mechanism.redundant) == (5 if redundant else 0)

@@ -1,4 +1,4 @@
-"""What joints and loops transmit in any closed mechanism: each body obeys Newton and Euler with what acts on it."""
+"""Joint and loop wrenches of random closed mechanisms: each body satisfies the Newton-Euler equations."""
 
 from __future__ import annotations
 
@@ -24,46 +24,48 @@ from tests.property.test_dynamics import every_mechanism
 many = settings(max_examples=25)
 
 
-def moving(closed: Closed) -> tuple[Terms, Array, Array, Array]:
-    """A state with rotors in the joints, random efforts u' in all of them, the acceleration and the multipliers."""
+def random_motion(closed: Closed) -> tuple[Terms, Array, Array, Array]:
+    """Return a state with rotors in the joints, random joint forces u', the acceleration and the multipliers."""
     mechanism, random = closed.mechanism, closed.world.random
     jointed = np.array([name not in mechanism.tree.free_coordinates for name in mechanism.coordinates])
     mechanism.tree.model.armature = np.where(jointed, random.uniform(0, 0.5, mechanism.n), 0.0)
-    terms, u_tree = closed.near(), np.where(jointed, closed.u_tree(), 0.0)
+    terms, u_tree = closed.random_state(), np.where(jointed, closed.u_tree(), 0.0)
     acceleration = dae_acceleration(terms, u_tree)
     return terms, u_tree, acceleration, multipliers(terms, u_tree, acceleration)
 
 
-def placed(force: Array, point: Array) -> Array:
-    """A force at a point as a wrench about the world's origin."""
+def wrench_at_origin(force: Array, point: Array) -> Array:
+    """Return the wrench about the world's origin of a force at a point."""
     return np.concatenate([force, np.cross(point, force)])
 
 
 @many
 @given(every_mechanism)
 def test_every_body_obeys_newton_and_euler(closed: Closed) -> None:
-    """The rates of momentum and the weights are Pinocchio's; springs pull along the line between their ends."""
-    terms, _, acceleration, forces = moving(closed)
+    """Rates of momentum and weights are computed by Pinocchio; springs act on the line between their ends."""
+    terms, _, acceleration, forces = random_motion(closed)
     mechanism, model = closed.mechanism, closed.mechanism.tree.model
     data = model.createData()
     pin.forwardKinematics(model, data, terms.q_tree, terms.v_tree, acceleration)
-    left = np.zeros((model.njoints, 6))
+    residual = np.zeros((model.njoints, 6))
     for k in range(1, model.njoints):
         inertia, motion = model.inertias[k], data.v[k]
         rate = data.oMi[k].act(inertia * data.a[k] + motion.cross(inertia * motion))
         centre = data.oMi[k].act(inertia.lever)
-        left[k] = placed(inertia.mass * model.gravity.linear, centre) - np.array(rate.vector)
+        residual[k] = wrench_at_origin(inertia.mass * model.gravity.linear, centre) - np.array(rate.vector)
     for name, wrench in joint_wrenches(terms, acceleration, forces).items():
         k = model.getJointId(name)
-        own = wrench + np.concatenate([np.zeros(3), np.cross(data.oMi[k].translation, wrench[:3])])
-        left[k] += own
-        left[model.parents[k]] -= own
+        about_origin = wrench + np.concatenate([np.zeros(3), np.cross(data.oMi[k].translation, wrench[:3])])
+        residual[k] += about_origin
+        residual[model.parents[k]] -= about_origin
     for loop in mechanism.spec.loop:
         a, b = (mechanism.frames.find(frame, loop.name) for frame in (loop.frame_a, loop.frame_b))
         wrench = loop_wrenches(terms, forces)[loop.name]
-        own = wrench + np.concatenate([np.zeros(3), np.cross(data.oMi[a.joint].act(a.translation), wrench[:3])])
-        left[a.joint] += own
-        left[b.joint] -= own
+        about_origin = wrench + np.concatenate(
+            [np.zeros(3), np.cross(data.oMi[a.joint].act(a.translation), wrench[:3])]
+        )
+        residual[a.joint] += about_origin
+        residual[b.joint] -= about_origin
     for spring in SPRINGS:
         if spring.frame_a is None or spring.frame_b is None:
             continue
@@ -72,21 +74,21 @@ def test_every_body_obeys_newton_and_euler(closed: Closed) -> None:
         turning = [data.oMi[end.joint].act(data.v[end.joint]) for end in ends]  # about the world's origin
         speeds = [v.linear + np.cross(v.angular, place) for v, place in zip(turning, places, strict=True)]
         length = np.linalg.norm(places[0] - places[1])
-        along = (places[0] - places[1]) / length
-        pull = spring.stiffness * (length - (spring.rest_length or 0.0)) + spring.damping * along @ (
+        direction = (places[0] - places[1]) / length
+        pull = spring.stiffness * (length - (spring.rest_length or 0.0)) + spring.damping * direction @ (
             speeds[0] - speeds[1]
         )
         for sign, end, place in zip((-1.0, 1.0), ends, places, strict=True):
-            left[end.joint] += placed(sign * pull * along, place)
+            residual[end.joint] += wrench_at_origin(sign * pull * direction, place)
     largest = max(np.abs(forces).max(initial=0.0), np.abs(terms.bias_tree).max(), 1.0)
-    assert_close(left[1:], 0, 1e-10 * largest)
+    assert_close(residual[1:], 0, 1e-10 * largest)
 
 
 @many
 @given(every_mechanism)
 def test_axial_joint_wrench_is_the_actuator_and_passive_torque(closed: Closed) -> None:
-    """Effort, joint spring and damper, coupling; the rotor takes its share of the effort for itself."""
-    terms, u_tree, acceleration, forces = moving(closed)
+    """It has actuator torque, joint spring, damper and coupling, less the torque that accelerates the rotor."""
+    terms, u_tree, acceleration, forces = random_motion(closed)
     mechanism, tree = closed.mechanism, closed.mechanism.tree
     expected = u_tree - tree.model.armature * acceleration - tree.model.damping * terms.v_tree
     numbers = tree.to_coordinates(terms.q_tree)
@@ -102,15 +104,16 @@ def test_axial_joint_wrench_is_the_actuator_and_passive_torque(closed: Closed) -
     for name, wrench in wrenches.items():
         joint = tree.model.getJointId(name)
         axis, turns = tree.axis(joint)
-        along = wrench[3:] if turns else wrench[:3]
-        own = float(along @ (terms.at.pose.rotation[joint] @ axis))
-        assert_close(own, expected[tree.index[name]], 1e-10 * max(1.0, np.abs(expected).max(), np.abs(forces).max()))
+        vector = wrench[3:] if turns else wrench[:3]
+        component = float(vector @ (terms.at.pose.rotation[joint] @ axis))
+        scale = max(1.0, np.abs(expected).max(), np.abs(forces).max())
+        assert_close(component, expected[tree.index[name]], 1e-10 * scale)
 
 
 @many
 @given(every_mechanism)
 def test_multipliers_of_the_motion_balance_the_tree(closed: Closed) -> None:
-    terms, u_tree, acceleration, forces = moving(closed)
+    terms, u_tree, acceleration, forces = random_motion(closed)
     needed = tree_force(terms, acceleration)
     assert_close(needed, u_tree + terms.at.J.T @ forces, 1e-9 * max(1.0, np.abs(needed).max()))
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
-from tests.property.mechanisms import Closed, along, closed_mechanism
+from tests.property.mechanisms import Closed, closed_mechanism, differentiate_along
 from tests.property.strategies import seeds
 from tests.property.worlds import World, slope
 
@@ -45,7 +45,9 @@ def test_spring_energy_matches_lengths(closed: Closed) -> None:
 def test_elastic_force_is_minus_the_gradient_of_energy(closed: Closed) -> None:
     q_tree, _ = anywhere(closed)
     springs, mechanism = closed.mechanism.springs, closed.mechanism
-    gradient = [along(mechanism, q_tree, e, lambda q: np.array(springs.energy(q))) for e in np.eye(mechanism.n)]
+    gradient = [
+        differentiate_along(mechanism, q_tree, e, lambda q: np.array(springs.energy(q))) for e in np.eye(mechanism.n)
+    ]
     assert_close(springs.elastic_force(q_tree), -np.array(gradient), 1e-8)
 
 
@@ -55,7 +57,7 @@ def test_elastic_gradient_is_minus_the_slope_of_the_force(closed: Closed) -> Non
     """Along the tangent coordinates, a free root's included."""
     q_tree, _ = anywhere(closed)
     springs, mechanism = closed.mechanism.springs, closed.mechanism
-    slopes = np.array([along(mechanism, q_tree, e, springs.elastic_force) for e in np.eye(mechanism.n)]).T
+    slopes = np.array([differentiate_along(mechanism, q_tree, e, springs.elastic_force) for e in np.eye(mechanism.n)]).T
     assert_close(springs.elastic_gradient(q_tree), -slopes, 1e-8)
 
 

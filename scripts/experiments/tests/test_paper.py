@@ -66,7 +66,7 @@ def test_template_variables_match_values_of_studies() -> None:
     jinja, named = environment(), set()
     for module in (ROOT / "scripts" / "experiments" / "paper").glob("*.py"):
         for call in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
-            if not isinstance(call, ast.Call) or getattr(call.func, "id", "") != "said":
+            if not isinstance(call, ast.Call) or getattr(call.func, "id", "") != "render_blocks":
                 continue
             name = ast.literal_eval(call.args[0])
             template = jinja.parse(jinja.loader.get_source(jinja, f"{name}.md.j2")[0])
