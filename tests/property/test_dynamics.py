@@ -189,7 +189,7 @@ def other_partition(at: Kinematics) -> Partition:
 def test_dynamics_do_not_depend_on_the_orientation_of_the_world(
     kind: str, seed: int, rpy: tuple[float, float, float], free: bool
 ) -> None:
-    """A rotation of everything, gravity included, does not change phi and J in frame A's axes, D', C', h' and motion."""
+    """A rotation of everything, gravity included, does not change phi and J in frame A's axes, D', C', h' or motion."""
     one = closed_mechanism(kind, seed, free=free)  # type: ignore[arg-type]
     assume(one.regular)
     two = closed_mechanism(kind, seed, free=free, turn=rotation(np.array(rpy)))  # type: ignore[arg-type]

@@ -39,7 +39,7 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def measured(name: str) -> dict[str, int]:
-    """Make a run and return its counts."""
+    """Run a scene and return its counts."""
     scene, overrides = RUNS[name]
     run = simulate(scene, {"solver.rtol": 1e-8, "solver.atol": 1e-10, **overrides})
     assert run.status == "done"
@@ -47,13 +47,13 @@ def measured(name: str) -> dict[str, int]:
 
 
 def recorded() -> dict[str, dict[str, int]]:
-    """Return the counts on file, by run."""
+    """Return the recorded counts by run."""
     counts: dict[str, dict[str, int]] = json.loads(FILE.read_text(encoding="utf-8"))
     return counts
 
 
 def changed(counts: dict[str, int], recorded_counts: dict[str, int]) -> dict[str, tuple[int, int]]:
-    """Return the counts that are off by more than 2 %, up or down: what was found, what is known."""
+    """Return the counts that differ from the recorded ones by more than 2 %, as (counted, recorded)."""
     return {
         name: (counts[name], recorded_counts[name])
         for name in recorded_counts
@@ -62,7 +62,7 @@ def changed(counts: dict[str, int], recorded_counts: dict[str, int]) -> dict[str
 
 
 def main() -> int:
-    """Write the file."""
+    """Record the counts in the file."""
     lines = [f"  {json.dumps(name)}: {json.dumps(measured(name))}" for name in RUNS]
     FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
     return 0

@@ -1,4 +1,4 @@
-"""The stiff flyball governor by hand: slider and the rods' common angle, the shaft's turning from its momentum."""
+"""Reference of the stiff flyball governor in the slider's position and the rods' angle, with conserved spin momentum."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ABOUT_HINGE = ROD * (1 / 3 + 1e-4 / 12) + ENDS
 
 
 def about_shaft(angle: float) -> tuple[float, float]:
-    """Inertia about the shaft, kg m^2, and its derivative by the rods' angle."""
+    """Return the inertia about the shaft, kg m^2, and its derivative with respect to the rods' angle."""
     cos, sin = np.cos(angle), np.sin(angle)
     along, upright = ROD * ACROSS, ROD * (1 + 1e-4) / 12  # of a rod about its centre
     reach = [(ROD, HINGE + cos / 2, -sin / 2), (ENDS, HINGE + cos, -sin)]
@@ -29,7 +29,7 @@ def about_shaft(angle: float) -> tuple[float, float]:
 
 
 def governor(t_end: float, rtol: float) -> dict[str, float]:
-    """Coordinates at t_end from 30 degrees, the slider at 0.5 m, one turn a second."""
+    """Return the coordinates at t_end from 30 degrees, with the slider at 0.5 m and one turn a second."""
     start = np.array([0.5, np.pi / 6, 0.0, 0.0, 0.0])
     momentum = about_shaft(start[1])[0] * 2 * np.pi
 

@@ -20,7 +20,7 @@ STEP = 1e-30
 
 @dataclass(frozen=True)
 class State:
-    """M (kg m^2), V (J) and the slider's place (m) at one theta."""
+    """M (kg m^2), V (J) and the slider's position (m) at one theta."""
 
     M: float
     V: float
@@ -52,7 +52,7 @@ def slider_crank(theta: float) -> State:
 
 
 def slider_crank_spatial(theta: float) -> State:
-    """Haug's: see slider_crank_spatial.urdf. The rod's spin about itself is what its universal joint leaves it."""
+    """Haug's mechanism, see slider_crank_spatial.urdf. The rod's spin follows from its universal joint."""
     along, across = 4e-4, 4e-3
 
     def place(th: complex) -> NDArray[np.complex128]:
@@ -71,7 +71,7 @@ def slider_crank_spatial(theta: float) -> State:
 
 
 def turning(mechanism: Mechanism, theta: float, theta_dot: float, t: NDArray) -> tuple[NDArray, NDArray]:
-    """Theta and its rate at instants t, from a start that has the energy to keep turning."""
+    """Return theta and its rate at instants t, from a start with enough energy for full turns."""
     start = mechanism(theta)
     energy = start.M * theta_dot**2 / 2 + start.V
 
@@ -85,6 +85,6 @@ def turning(mechanism: Mechanism, theta: float, theta_dot: float, t: NDArray) ->
 
 
 def pendulum_period(angle: float) -> float:
-    """Period of a 1 m pendulum released from rest at an angle from +x, g along -y."""
+    """Return the period of a 1 m pendulum released from rest at an angle from +x, g along -y."""
     amplitude = angle + np.pi / 2
     return 4 * np.sqrt(1.0 / G) * float(ellipk(np.sin(amplitude / 2) ** 2))

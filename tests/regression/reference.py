@@ -1,4 +1,4 @@
-"""The trajectories in `data/`, which numpy and scipy integrated, and runs to hold against them."""
+"""Reference trajectories in `data/`, integrated by NumPy and SciPy, and comparisons of runs with them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FORMULATIONS = ("reduced", "spf", "dae")
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Rows at the instants t; what is in them is in the script beside the files."""
+    """Rows at the instants t. `data/make_trajectories.py` describes their columns."""
 
     mechanism: str
     scene: str
