@@ -1,4 +1,4 @@
-"""Reference of the stiff flyball governor in the slider's position and the rods' angle, with conserved spin momentum."""
+"""Reference of the stiff flyball governor: slider, rods' common angle, and spin from the conserved momentum."""
 
 from __future__ import annotations
 
