@@ -31,7 +31,13 @@ std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int siz
               "spline: a finite row of coefficients for each piece is needed");
     return std::make_unique<SplineTrajectory>(breaks, coefficients);
   }
-  require(kind == "point", "desired: the kind must be harmonics, spline or point");
+  if (kind == "sum") {
+    std::vector<std::unique_ptr<Trajectory>> parts;
+    for (const auto& part : get<std::vector<nb::dict>>(table, "parts"))
+      parts.push_back(trajectory_from_table(part, size));
+    return std::make_unique<SumTrajectory>(std::move(parts), size);
+  }
+  require(kind == "point", "desired: the kind must be harmonics, spline, sum or point");
   PointTrajectory::Task task{
       model_from_table(table),    get<Indices>(table, "q_index"), closure_from_table(get<nb::dict>(table, "closure")),
       get<Indices>(table, "psi"), get<Indices>(table, "axis"),    get<Vector>(table, "level")};

@@ -170,6 +170,11 @@ void Control::start() {
   sample_ = constant;
   if (sensor) sensor->reset();
   if (drive) drive->output.setZero(tau.size());
+  start_segment(-std::numeric_limits<double>::infinity(), sampling->time_tolerance(0.0));
+}
+
+void Control::start_segment(double t, double tolerance) {
+  if (law && !sampling->holds_output) law->set_segment(t, sampling->next_sample_time(), tolerance);
 }
 
 bool Control::set_constant(In value, bool outputs_torques) {
@@ -340,6 +345,7 @@ bool Control::sample(const MeasuredState& at, bool& changed) {
       changed = true;
     }
     ++sampling->next_sample;
+    start_segment(sample, sampling->time_tolerance(sample));
   }
   for (; sampling->queue_size && sampling->queue[sampling->queue_begin].first <= now; --sampling->queue_size) {
     const Vector& value = sampling->queue[sampling->queue_begin].second;

@@ -37,6 +37,8 @@ class Controller {
   // Compute eq. 6's force u, or motor torques. If there is none, return false and set `failure`.
   virtual bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) = 0;
   virtual bool outputs_torques() const { return false; }
+  // Times from now on lie in [begin, end], see Trajectory.
+  virtual void set_segment(double /*begin*/, double /*end*/, double /*tolerance*/) {}
   // Value of the Lyapunov function, NaN if there is none. `w`: present value of phi.
   virtual double lyapunov(const MeasuredState&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it uses terms in the fixed partition, not only q and q_dot.
@@ -74,6 +76,9 @@ class TrackingController : public Controller {
   TrackingController(Matrix Lambda, Matrix K_D, std::unique_ptr<Trajectory> desired, std::unique_ptr<Core> model,
                      bool actual);
   bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override;
+  void set_segment(double begin, double end, double tolerance) override {
+    desired_->set_segment(begin, end, tolerance);
+  }
   double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
   bool derivatives(Core& plant, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override;
   void gain_derivative(const MeasuredState& at, const Matrix& Lambda, const Matrix& K_D, Out derivative) override;
@@ -131,7 +136,7 @@ class Actuation {
 struct Sampling {
   double period = 0.0, delay = 0.0;
   Vector times;  // sample times, if they are not periodic
-  // False: no hold. The control is piecewise smooth, and its derivatives jump at the instants.
+  // False: no hold. The control is piecewise smooth. It or its derivatives jump at the instants.
   bool holds_output = true;
   long next_sample = 0;                        // index of the next sample
   int samples_taken = 0, outputs_applied = 0;  // at the last instant
@@ -200,6 +205,7 @@ class Control {
  private:
   bool evaluate_law(const MeasuredState& at, Out u);
   bool evaluate_sample(const MeasuredState& at);  // sets sample_
+  void start_segment(double t, double tolerance);  // until the next instant, if nothing is held
   bool check_finite(In u);                        // stores u in `failure` if it is not finite
   MeasuredState in_fixed_partition(const MeasuredState& at);
   bool limited_motor_derivatives(Core& core, Matrix& by_q, Matrix& by_v);

@@ -27,10 +27,20 @@ bool HarmonicTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
 SplineTrajectory::SplineTrajectory(Vector breaks, std::vector<Matrix> coefficients)
     : breaks_(std::move(breaks)), coefficients_(std::move(coefficients)) {}
 
-bool SplineTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
+Eigen::Index SplineTrajectory::piece_at(double t) const {
   const double* begin = breaks_.data();
   const auto pieces = breaks_.size() - 1;
-  const auto piece = std::clamp<Eigen::Index>(std::upper_bound(begin, begin + pieces, t) - begin - 1, 0, pieces - 1);
+  return std::clamp<Eigen::Index>(std::upper_bound(begin, begin + pieces, t) - begin - 1, 0, pieces - 1);
+}
+
+void SplineTrajectory::set_segment(double begin, double end, double tolerance) {
+  first_ = piece_at(begin + tolerance), last_ = std::max(first_, piece_at(end - tolerance));
+  begin_ = begin - tolerance, end_ = end + tolerance;
+}
+
+bool SplineTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
+  auto piece = piece_at(t);
+  if (t >= begin_ && t <= end_) piece = std::clamp(piece, first_, last_);
   const double s = t - breaks_(piece);
   x.setZero(), x_dot.setZero(), x_ddot.setZero();
   for (const Matrix& c : coefficients_) {  // Horner's scheme with both derivatives
@@ -39,6 +49,22 @@ bool SplineTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
     x = x * s + c.row(piece).transpose();
   }
   return true;
+}
+
+SumTrajectory::SumTrajectory(std::vector<std::unique_ptr<Trajectory>> parts, Eigen::Index size)
+    : parts_(std::move(parts)), x_(size), x_dot_(size), x_ddot_(size) {}
+
+bool SumTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
+  x.setZero(), x_dot.setZero(), x_ddot.setZero();
+  for (const auto& part : parts_) {
+    if (!(*part)(t, x_, x_dot_, x_ddot_)) return failure = part->failure, false;
+    x += x_, x_dot += x_dot_, x_ddot += x_ddot_;
+  }
+  return true;
+}
+
+void SumTrajectory::set_segment(double begin, double end, double tolerance) {
+  for (const auto& part : parts_) part->set_segment(begin, end, tolerance);
 }
 
 constexpr int max_newton_steps = 20;

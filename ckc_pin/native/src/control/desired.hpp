@@ -1,6 +1,7 @@
-// Desired trajectories q_d(t) with two derivatives: sums of sines, splines, or the path of a point.
+// Desired trajectories q_d(t) with two derivatives: sums of sines, piecewise polynomials, their sums, or the path of a point.
 #pragma once
 
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -15,6 +16,9 @@ class Trajectory {
   virtual ~Trajectory() = default;
   // Evaluate at t. False if undefined there; `failure` says why.
   virtual bool operator()(double t, Out x, Out x_dot, Out x_ddot) = 0;
+  // Times from now on lie in [begin, end], up to the tolerance. Where derivatives jump at an end, evaluate the limit
+  // from inside, so that a step which ends there does not see the jump.
+  virtual void set_segment(double /*begin*/, double /*end*/, double /*tolerance*/) {}
   std::string failure;
 };
 
@@ -34,10 +38,26 @@ class SplineTrajectory : public Trajectory {
   // Piecewise polynomials. `coefficients`: one matrix per power, the highest first, with one row per piece.
   SplineTrajectory(Vector breaks, std::vector<Matrix> coefficients);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+  void set_segment(double begin, double end, double tolerance) override;
 
  private:
+  Eigen::Index piece_at(double t) const;
   Vector breaks_;
   std::vector<Matrix> coefficients_;
+  // A segment, with its tolerance, and its pieces. Empty at first.
+  double begin_ = std::numeric_limits<double>::infinity(), end_ = -begin_;
+  Eigen::Index first_ = 0, last_ = 0;
+};
+
+class SumTrajectory : public Trajectory {
+ public:
+  SumTrajectory(std::vector<std::unique_ptr<Trajectory>> parts, Eigen::Index size);
+  bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+  void set_segment(double begin, double end, double tolerance) override;
+
+ private:
+  std::vector<std::unique_ptr<Trajectory>> parts_;
+  Vector x_, x_dot_, x_ddot_;  // of a part
 };
 
 // q_d(t) that moves a point along a path, by Newton's method on Psi(q') = [phi; coordinates of the point].
@@ -61,6 +81,9 @@ class PointTrajectory : public Trajectory {
   // `path`: of the point; `q`: the coordinates of q_d; `tolerance`: of |Psi|.
   PointTrajectory(Task task, std::unique_ptr<Trajectory> path, Indices q, Knots knots, double tolerance);
   bool operator()(double t, Out x, Out x_dot, Out x_ddot) override;
+  void set_segment(double begin, double end, double tolerance) override {
+    path_->set_segment(begin, end, tolerance);
+  }
 
  private:
   static constexpr int nodes = 3;  // points interpolated between knots, by polynomials of degree 5

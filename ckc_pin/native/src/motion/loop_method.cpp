@@ -44,8 +44,10 @@ void StepLoop::choose_explicit_method(double bound) {
 
 // Expected duration of the present segment: until the bound, or the mean of the previous segments between joint
 // transitions, but at least the time since the last one.
+// Instants without a hold hardly excite decayed modes, so they do not end a segment.
 double StepLoop::segment_duration(double bound) const {
-  const double remaining = bound - now.t;
+  const bool is_smooth = control->sampling && !control->sampling->holds_output;
+  const double remaining = (is_smooth ? std::max(bound, target_) : bound) - now.t;
   return joint_segments_ ? std::min(remaining, std::max((now.t - start_.t) / static_cast<double>(joint_segments_),
                                                         now.t - joint_modes_time_))
                          : remaining;
