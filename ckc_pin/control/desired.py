@@ -11,17 +11,40 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import convert
-from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.control.piecewise import (
+    Interpolation,
+    PiecewisePolynomial,
+    interpolate,
+    line,
+    pass_waypoints,
+    side_by_side,
+)
+from ckc_pin.control.spec import MotionSpec, TableSpec, require_profile
 from ckc_pin.errors import InputError
 
-__all__ = ["Desired", "Harmonics", "Table", "count_cycles", "read_columns", "read_desired", "read_table"]
+__all__ = [
+    "Desired",
+    "Harmonics",
+    "Sum",
+    "Table",
+    "count_cycles",
+    "find_rate_jump",
+    "make_motion",
+    "read_columns",
+    "read_desired",
+    "read_table",
+]
 
 MIN_SPLINE_ROWS = 6  # of a quintic spline
 CONSTANT_TOLERANCE = 1e-9  # relative to 1 + largest value: range of a table's column that counts as constant
 
 
 class Desired(Protocol):
-    """A trajectory of the independent coordinates. Any callable of this form can be used."""
+    """A trajectory of the independent coordinates. Any callable of this form can be used.
+
+    It may have the attribute `max_frequency`, in rad/s: the workspace check samples it and waves of this frequency
+    finely enough.
+    """
 
     def __call__(self, t: float) -> tuple[Array, Array, Array]:
         """Return q_d, its rate and its acceleration at time t (s), each of shape (d,)."""
@@ -32,13 +55,20 @@ def count_cycles(desired: Desired, t_end: float) -> float:
     return float(getattr(desired, "max_frequency", 0.0)) * t_end / (2 * np.pi)
 
 
+def find_rate_jump(desired: Desired, t_end: float) -> float | None:
+    """Return the first time between 0 and t_end (s) at which the rate of a trajectory jumps, None if it never does."""
+    jumps = np.asarray(getattr(desired, "rate_jumps", ()))
+    inside = jumps[(jumps > 0.0) & (jumps < t_end)]
+    return float(inside[0]) if len(inside) else None
+
+
 class Harmonics:
     """offset + sum of amplitude * sin(frequency * t + phase), per coordinate.
 
     Parameters
     ----------
-    specs : sequence of HarmonicsSpec
-        In the order of `independent`.
+    specs : sequence of MotionSpec
+        In the order of `independent`. Rates and waypoints are left out.
 
     Attributes
     ----------
@@ -48,7 +78,7 @@ class Harmonics:
         Infinite: the trajectory has no end.
     """
 
-    def __init__(self, specs: Sequence[HarmonicsSpec]) -> None:
+    def __init__(self, specs: Sequence[MotionSpec]) -> None:
         count = max((len(spec.harmonics) for spec in specs), default=0)
         waves = np.zeros((3, len(specs), count))  # padded with zero amplitudes
         for k, spec in enumerate(specs):
@@ -68,19 +98,19 @@ class Harmonics:
         )
 
 
-class Table:
-    """Samples over time, interpolated by a quintic spline, so that the acceleration is smooth.
+class Table(PiecewisePolynomial):
+    """Samples over time, interpolated.
 
     Parameters
     ----------
     t : (m,) array
-        Increasing times, at least six, s.
+        Increasing times, s. A spline with fewer rows than its degree + 1 is one polynomial.
     q : (m, d) array
+    interpolation : {"quintic", "cubic", "linear"}
+        The rate of a linear interpolation jumps at each row. The splines are smooth, but may swing beyond their rows.
 
     Attributes
     ----------
-    spline : scipy.interpolate.BSpline
-        q_d.
     max_frequency : float
         Frequency of a sine wave with the ratio of largest acceleration to largest rate of the table's fastest column,
         rad/s.
@@ -88,23 +118,48 @@ class Table:
         Last time, s.
     """
 
-    def __init__(self, t: Array, q: Array) -> None:
-        from scipy.interpolate import make_interp_spline
-
-        self.spline = make_interp_spline(t, q, k=5)
-        self._q_dot = self.spline.derivative()
-        self._q_ddot = self._q_dot.derivative()
+    def __init__(self, t: Array, q: Array, interpolation: Interpolation = "quintic") -> None:
+        breaks, coefficients = interpolate(t, q, interpolation)
+        jumps = t[1:-1] if interpolation == "linear" else ()
+        corners = () if interpolation == "quintic" else breaks[1:-1]
+        super().__init__(breaks, coefficients, corners=corners, rate_jumps=jumps, end=float(t[-1]))
         varies = np.ptp(q, axis=0) > CONSTANT_TOLERANCE * (1 + np.abs(q).max(axis=0))
-        rates, accelerations = (np.abs(f(t)[:, varies]).max(axis=0) for f in (self._q_dot, self._q_ddot))
-        self.max_frequency = float((accelerations / rates).max(initial=0.0))
-        self.end = float(t[-1])
+        _, rates, accelerations = (np.abs(x[:, varies]) for x in self(t))
+        if interpolation == "linear":
+            steps = np.diff(t)
+            accelerations = np.abs(np.diff(rates, axis=0)[:-1]) / np.minimum(steps[1:], steps[:-1])[:, np.newaxis]
+        largest = (x.max(axis=0, initial=0.0) for x in (accelerations, rates))
+        self.max_frequency = float(np.divide(*largest).max(initial=0.0))
 
-    def __call__(self, t: float | Array) -> tuple[Array, Array, Array]:
-        return self.spline(t), self._q_dot(t), self._q_ddot(t)
+
+class Sum:
+    """Sum of harmonics and a piecewise polynomial.
+
+    Parameters
+    ----------
+    harmonics : Harmonics
+    polynomial : PiecewisePolynomial
+
+    Attributes
+    ----------
+    max_frequency, corners, rate_jumps, end
+        As of its parts.
+    """
+
+    def __init__(self, harmonics: Harmonics, polynomial: PiecewisePolynomial) -> None:
+        self.harmonics, self.polynomial = harmonics, polynomial
+        self.max_frequency = max(harmonics.max_frequency, polynomial.max_frequency)
+        self.corners, self.rate_jumps, self.end = polynomial.corners, polynomial.rate_jumps, polynomial.end
+
+    def __call__(self, t: float) -> tuple[Array, Array, Array]:
+        (x, x_dot, x_ddot), (y, y_dot, y_ddot) = self.harmonics(t), self.polynomial(t)
+        return x + y, x_dot + y_dot, x_ddot + y_ddot
 
 
-def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sources) -> Harmonics | Table:
-    """Read the `[controller.desired]` table: harmonics by joint, or the name of a CSV file.
+def read_desired(
+    desired: Mapping[str, Any], names: Sequence[str], sources: Sources
+) -> Harmonics | PiecewisePolynomial | Sum:
+    """Read the `[controller.desired]` table: a motion for each joint, or the name of a CSV file.
 
     Raises
     ------
@@ -112,23 +167,72 @@ def read_desired(desired: Mapping[str, Any], names: Sequence[str], sources: Sour
         An unknown or missing joint, or a file that is not a trajectory.
     """
     where = f"{sources.name}: controller.desired"
-    if "file" in desired:
-        if len(desired) > 1 or not isinstance(desired["file"], str):
-            raise InputError(f'{where}: either file = "NAME.csv" alone, or a table for each of {", ".join(names)}')
-        return read_table(sources.text(desired["file"]), names, desired["file"])
+    if "file" in desired and "file" not in names:
+        if not isinstance(desired["file"], str) or not set(desired) <= {"file", "interpolation"}:
+            raise InputError(
+                f'{where}: either file = "NAME.csv", alone or with interpolation, or a table for each of '
+                f"{', '.join(names)}"
+            )
+        spec = convert(dict(desired), TableSpec, sources.name, "controller.desired")
+        return read_table(sources.text(spec.file), names, spec.file, spec.interpolation)
     unknown = [name for name in desired if name not in names]
     missing = [name for name in names if name not in desired]
     if unknown or missing:
         problem = f"{unknown[0]!r} is none of them" if unknown else f"{missing[0]!r} is missing"
         raise InputError(f"{where}: needs a table for each of {', '.join(names)} (or file); {problem}")
-    return Harmonics(
-        [convert(desired[name], HarmonicsSpec, sources.name, f"controller.desired.{name}") for name in names]
-    )
+    specs = [convert(desired[name], MotionSpec, sources.name, f"controller.desired.{name}") for name in names]
+    return make_motion(specs, [f"{where}.{name}" for name in names])
 
 
-def read_table(text: str, names: Sequence[str], file: str) -> Table:
-    """Read a trajectory from CSV text with `t` and a column for each name."""
-    return Table(*read_columns(text, names, file, MIN_SPLINE_ROWS, "a smooth trajectory needs"))
+def make_motion(specs: Sequence[MotionSpec], where: Sequence[str]) -> Harmonics | PiecewisePolynomial | Sum:
+    """Build the motion of several coordinates, each from its own table.
+
+    Parameters
+    ----------
+    specs : sequence of MotionSpec
+    where : sequence of str
+        The place of each table, for messages.
+
+    Raises
+    ------
+    InputError
+        Keys that do not go together, times that do not increase, or a trapezoid beyond its limits.
+    """
+    for spec, place in zip(specs, where, strict=True):
+        require_profile(spec, place)
+    harmonics = Harmonics(specs)
+    if all(spec.rate == 0.0 and spec.waypoints is None for spec in specs):
+        return harmonics
+    polynomial = side_by_side([_polynomial(spec, place) for spec, place in zip(specs, where, strict=True)])
+    harmonics.offset = np.zeros(len(specs))
+    return Sum(harmonics, polynomial) if any(spec.harmonics for spec in specs) else polynomial
+
+
+def _polynomial(spec: MotionSpec, where: str) -> PiecewisePolynomial:
+    """Return offset + rate t, plus the waypoints."""
+    motion = line(np.array([float(spec.offset)]), np.array([float(spec.rate)]))
+    if spec.waypoints is None:
+        return motion
+    t, x = np.array(spec.waypoints, dtype=float).reshape(-1, 2).T
+    limits = (spec.max_rate, spec.max_acceleration)
+    way = pass_waypoints(t, x[:, np.newaxis], spec.profile or "quintic", *limits, f"{where}.waypoints")
+    way.coefficients[-1] += motion(way.breaks[:-1])[0]
+    way.coefficients[-2] += spec.rate
+    way.max_frequency += motion.max_frequency
+    return way
+
+
+def read_table(text: str, names: Sequence[str], file: str, interpolation: Interpolation | None = None) -> Table:
+    """Read a trajectory from CSV text with `t` and a column for each name.
+
+    Without an interpolation, it is quintic, and the rows must be enough for one that is smooth.
+    """
+    if interpolation is None:
+        requirement = (
+            'without the key interpolation, which may be "linear", "cubic" or "quintic", a smooth trajectory needs'
+        )
+        return Table(*read_columns(text, names, file, MIN_SPLINE_ROWS, requirement))
+    return Table(*read_columns(text, names, file, 2, "interpolation needs"), interpolation)
 
 
 def read_columns(text: str, names: Sequence[str], file: str, min_rows: int, requirement: str) -> tuple[Array, Array]:

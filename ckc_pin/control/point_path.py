@@ -16,7 +16,9 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import FileStruct, convert
-from ckc_pin.control.desired import Harmonics, Table, read_desired, read_table
+from ckc_pin.control.desired import Harmonics, Sum, Table, read_desired, read_table
+from ckc_pin.control.piecewise import Interpolation, PiecewisePolynomial, pass_waypoints
+from ckc_pin.control.spec import WaypointsSpec, require_profile
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
 from ckc_pin.mechanism.batch import difference_many, integrate_many
@@ -97,8 +99,8 @@ class LineSpec(FileStruct, frozen=True):
     frequency: float
 
 
-class PointPathSpec(FileStruct, frozen=True):
-    """`[controller.desired]` with `point` in it, and one of file, circle and line.
+class PointPathSpec(WaypointsSpec, frozen=True):
+    """`[controller.desired]` with `point` in it, and one of file, circle, line and waypoints.
 
     Attributes
     ----------
@@ -106,20 +108,34 @@ class PointPathSpec(FileStruct, frozen=True):
         A ``[[point]]`` of the mechanism.
         ``point = "tip"``
     file
-        CSV with the columns ``t, x, y, z``; one of ``file``, ``circle``, ``line``.
+        CSV with the columns ``t, x, y, z``; one of ``file``, ``circle``, ``line``, ``waypoints``.
         ``file = "path.csv"``
+    interpolation
+        Between the rows of ``file``; if absent, ``"quintic"`` with at least six rows.
+        ``interpolation = "cubic"``
     circle
         A circular path.
         ``circle = {centre = [0.15, -0.42, 0.0], radius = 0.06, frequency = 1.0}``
     line
         A straight path there and back.
         ``line = {start = [0.1, -0.4, 0.0], end = [0.2, -0.4, 0.0], frequency = 2.0}``
+    waypoints : s, m
+        ``[t, [x, y, z]]`` each, at least two; the position is held before the first and after the last.
+        ``waypoints = [[0.0, [0.1, -0.4, 0.0]], [1.0, [0.2, -0.4, 0.0]]]``
+    max_rate : m/s
+        Limit of the speed along the straight line, of ``profile = "trapezoidal"`` only.
+        ``max_rate = 0.5``
+    max_acceleration : m/s²
+        Acceleration along the line where it begins and ends, of ``profile = "trapezoidal"`` only.
+        ``max_acceleration = 2.0``
     """
 
     point: str
     file: str | None = None
+    interpolation: Interpolation | None = None
     circle: CircleSpec | None = None
     line: LineSpec | None = None
+    waypoints: list[tuple[float, Vector3]] | None = None
 
 
 class Circle:
@@ -180,6 +196,8 @@ class PointPath:
         When the path leaves the workspace of its working mode or of its assembly branch, s.
     max_frequency : float
         Of the path, rad/s.
+    corners, rate_jumps : (k,) arrays
+        Times at which a run begins a new step, and at which the rate jumps, s.
 
     Raises
     ------
@@ -191,6 +209,7 @@ class PointPath:
         self.point = point
         self.path = path
         self.max_frequency = path.max_frequency
+        self.corners, self.rate_jumps = (np.asarray(getattr(path, name, ())) for name in ("corners", "rate_jumps"))
         self.leaves_at: float | None = None
         with one_blas_thread():
             try:
@@ -295,7 +314,7 @@ def _lagrange_weights(x: Array) -> Array:
 
 def make_desired(
     desired: Mapping[str, Any], mechanism: Mechanism, sources: Sources, t_end: float
-) -> Harmonics | Table | PointPath:
+) -> Harmonics | PiecewisePolynomial | Sum | PointPath:
     """Build the trajectory of a `[controller.desired]` table, of the independent coordinates or of a point.
 
     Raises
@@ -310,18 +329,29 @@ def make_desired(
         return trajectory
     where = "controller.desired"
     spec = convert(dict(desired), PointPathSpec, sources.name, where)
-    names = [name for name in ("file", "circle", "line") if getattr(spec, name) is not None]
+    choices = ("file", "circle", "line", "waypoints")
+    names = [name for name in choices if getattr(spec, name) is not None]
+    where = f"{sources.name}: {where}"
     if len(names) != 1:
-        raise InputError(f"{sources.name}: {where}: point needs exactly one of file, circle and line, got {names}")
-    path: PointTrajectory
+        raise InputError(f"{where}: point needs exactly one of file, circle, line and waypoints, got {names}")
+    if spec.interpolation is not None and spec.file is None:
+        raise InputError(f"{where}: interpolation belongs to file, not to {names[0]}; remove it")
+    require_profile(spec, where)
+    return PointPath(Point(mechanism, spec.point), _make_path(spec, sources, where, t_end), t_end)
+
+
+def _make_path(spec: PointPathSpec, sources: Sources, where: str, t_end: float) -> PointTrajectory:
     if spec.circle is not None:
-        path = Circle(spec.circle)
-    elif spec.line is not None:
-        path = Line(spec.line)
-    else:
-        path = table = read_table(sources.text(str(spec.file)), ("x", "y", "z"), str(spec.file))
-        _require_length(table, str(spec.file), t_end)
-    return PointPath(Point(mechanism, spec.point), path, t_end)
+        return Circle(spec.circle)
+    if spec.line is not None:
+        return Line(spec.line)
+    if spec.waypoints is not None:
+        t, x = (np.array([waypoint[k] for waypoint in spec.waypoints], dtype=float) for k in (0, 1))
+        limits = (spec.max_rate, spec.max_acceleration)
+        return pass_waypoints(t, x, spec.profile or "quintic", *limits, f"{where}.waypoints")
+    table = read_table(sources.text(str(spec.file)), ("x", "y", "z"), str(spec.file), spec.interpolation)
+    _require_length(table, str(spec.file), t_end)
+    return table
 
 
 def _require_length(table: Table, file: str, t_end: float) -> None:

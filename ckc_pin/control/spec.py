@@ -11,6 +11,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.toml import FileStruct
 from ckc_pin.base.validation import describe_value, is_number
+from ckc_pin.control.piecewise import Interpolation, Profile
 from ckc_pin.errors import InputError
 
 __all__ = [
@@ -19,13 +20,16 @@ __all__ = [
     "DriveSpec",
     "FeedbackSpec",
     "Gain",
-    "HarmonicsSpec",
+    "MotionSpec",
     "SensorSpec",
     "SetPointSpec",
+    "TableSpec",
     "TorquesSpec",
     "TrackingSpec",
+    "WaypointsSpec",
     "gain_matrix",
     "require_positive_definite",
+    "require_profile",
 ]
 
 MAX_GAIN = 1e100  # products of gains and their squares do not overflow
@@ -216,21 +220,89 @@ FeedbackSpec = SetPointSpec | TrackingSpec
 ControllerSpec = SetPointSpec | TrackingSpec | TorquesSpec
 
 
-class HarmonicsSpec(FileStruct, frozen=True, kw_only=True):
-    """Offset + sum of amplitude * sin(frequency * t + phase).
+class WaypointsSpec(FileStruct, frozen=True, kw_only=True):
+    """How a motion passes its waypoints.
+
+    Attributes
+    ----------
+    profile
+        Of the motion between waypoints; ``"quintic"`` if absent.
+        ``profile = "trapezoidal"``
+    max_rate : rad/s, m/s
+        Limit of the rate, of ``profile = "trapezoidal"`` only.
+        ``max_rate = 2.0``
+    max_acceleration : rad/s², m/s²
+        Acceleration at the beginning and at the end of each piece, of ``profile = "trapezoidal"`` only.
+        ``max_acceleration = 8.0``
+    """
+
+    profile: Profile | None = None
+    max_rate: Limit | None = None
+    max_acceleration: Limit | None = None
+
+
+class MotionSpec(WaypointsSpec, frozen=True, kw_only=True):
+    """Motion of one coordinate: offset + rate t + sum of amplitude sin(frequency t + phase) + waypoints.
 
     Attributes
     ----------
     offset : rad, m
-        Mean value.
+        Constant part of the value.
         ``offset = -1.4``
+    rate : rad/s, m/s
+        Constant part of the rate, for ever.
+        ``rate = 6.2832``
     harmonics : rad or m, rad/s, rad
         Any number of waves, ``[amplitude, frequency, phase]`` each.
         ``harmonics = [[1.0472, 1.0, 0.0]]``
+    waypoints : s, rad or m
+        ``[t, value]`` each, at least two; the value is held before the first and after the last.
+        ``waypoints = [[0.0, 0.0], [1.0, 0.8], [2.0, 0.5]]``
     """
 
     offset: float = 0.0
+    rate: float = 0.0
     harmonics: list[tuple[float, float, float]] = []
+    waypoints: list[tuple[float, float]] | None = None
+
+
+class TableSpec(FileStruct, frozen=True, kw_only=True):
+    """A desired motion in a CSV file, alone in ``[controller.desired]``.
+
+    Attributes
+    ----------
+    file
+        CSV with the column ``t``, s, and a column for each independent coordinate, rad or m.
+        ``file = "way.csv"``
+    interpolation
+        Between rows; if absent, ``"quintic"`` with at least six rows.
+        ``interpolation = "linear"``
+    """
+
+    file: str
+    interpolation: Interpolation | None = None
+
+
+def require_profile(spec: WaypointsSpec, where: str) -> None:
+    """Raise InputError if the keys about waypoints do not go together. `where` is their table, for messages."""
+    limits = {"max_rate": spec.max_rate, "max_acceleration": spec.max_acceleration}
+    present = [name for name, value in limits.items() if value is not None]
+    missing = [name for name, value in limits.items() if value is None]
+    if getattr(spec, "waypoints", None) is None:
+        extra = [*(["profile"] if spec.profile is not None else []), *present]
+        if extra:
+            raise InputError(
+                f"{where}: {extra[0]} belongs to waypoints, which are missing; add waypoints = [[t, value], ...]"
+            )
+    elif spec.profile == "trapezoidal" and missing:
+        raise InputError(
+            f'{where}: profile = "trapezoidal" needs max_rate and max_acceleration; {missing[0]} is missing'
+        )
+    elif spec.profile != "trapezoidal" and present:
+        raise InputError(
+            f'{where}: {present[0]} belongs to profile = "trapezoidal", not to "{spec.profile or "quintic"}", whose '
+            "rate follows from the times; remove it or change the profile"
+        )
 
 
 def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
-from ckc_pin.control.desired import count_cycles
+from ckc_pin.control.desired import count_cycles, find_rate_jump
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
@@ -50,8 +50,13 @@ def tracking_stability(
     Raises
     ------
     NumericalError
-        The motion is too fast or leaves the workspace, or the loop cannot be linearized along it.
+        The motion is too fast or leaves the workspace, its rate jumps, or the loop cannot be linearized along it.
     """
+    jump = find_rate_jump(law.desired, t_end)
+    if jump is not None:
+        raise NumericalError(
+            f"the desired rate jumps at t = {jump:.6g} s, where a run deviates from the desired motion"
+        )
     cycle_count = count_cycles(law.desired, t_end)
     if 2 * STEPS_PER_CYCLE * cycle_count > MAX_STEPS:
         longest = MAX_STEPS / (2 * STEPS_PER_CYCLE * cycle_count) * t_end

@@ -7,7 +7,7 @@ to the motors can also be computed alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,8 @@ from ckc_pin.control.controllers import (
     Tracking,
     is_torque_controller,
 )
-from ckc_pin.control.desired import Desired, Harmonics, Table
+from ckc_pin.control.desired import Desired, Harmonics, Sum
+from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.control.point_path import Circle, Line, PointPath, PointTrajectory
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
@@ -35,6 +36,7 @@ from ckc_pin.native.tables import closure_table, core_table, packed
 __all__ = ["actuation_table", "allocate", "apply_u", "control_table", "law_table"]
 
 QUARTER = math.pi / 2
+TIME_TOLERANCE = 1e-9  # s, and relative to the time: breaks of a desired motion closer than this are one
 
 
 def control_table(
@@ -76,6 +78,11 @@ def control_table(
     if type(controller) is RecordedTorques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
         table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds_output=not controller.interpolates)
+    if type(controller) is Tracking and "clock" not in table:
+        corners = _distinct(getattr(controller.desired, "corners", ()))
+        if len(corners):
+            spacing = float(np.diff(corners, prepend=0.0).min())
+            table["clock"] = _clock(min(spacing, 1.0), times=corners, holds_output=False)
     callback = {
         "kind": "call",
         "function": call(controller),
@@ -148,6 +155,13 @@ def _clock(
     }
 
 
+def _distinct(times: Sequence[float] | Array) -> Array:
+    """Return the positive ones of increasing times, without those that differ from another one by rounding only."""
+    times = np.asarray(times, dtype=float)
+    times = times[times > TIME_TOLERANCE]
+    return times[np.diff(times, prepend=0.0) > TIME_TOLERANCE * np.maximum(1.0, times)]
+
+
 def _sensor(sensor: SensorSpec, mechanism: Mechanism, period: float, *, closes: bool) -> dict[str, Any]:
     """Return the table of a sensor; `closes`: the controller needs more than q and q_dot, so the loops are closed."""
     table: dict[str, Any] = {
@@ -195,8 +209,10 @@ def _desired(desired: Desired | PointTrajectory) -> dict[str, Any] | None:
     match desired:
         case Harmonics():
             return _harmonics(desired.offset, desired.amplitude, desired.frequency, desired.phase)
-        case Table():
+        case PiecewisePolynomial():
             return _spline(desired)
+        case Sum():
+            return {"kind": "sum", "parts": [_desired(desired.harmonics), _spline(desired.polynomial)]}
         case PointPath():
             return _point(desired)
         case Circle():  # centre + radius (a cos(angle) + b sin(angle))
@@ -218,13 +234,9 @@ def _harmonics(offset: Array, amplitude: Array, frequency: Array, phase: Array) 
     return {"kind": "harmonics", "offset": offset, "amplitude": amplitude, "frequency": frequency, "phase": phase}
 
 
-def _spline(table: Table) -> dict[str, Any]:
-    """Return a spline as Taylor polynomials: breaks, and by power from the highest, coefficients by piece."""
-    spline = table.spline
-    breaks = np.unique(spline.t)
-    powers = range(spline.k, -1, -1)
-    coefficients = [np.asfortranarray(spline(breaks[:-1], nu=k) / math.factorial(k)) for k in powers]
-    return {"kind": "spline", "breaks": breaks, "coefficients": coefficients}
+def _spline(motion: PiecewisePolynomial) -> dict[str, Any]:
+    coefficients = [np.asfortranarray(c) for c in motion.coefficients]
+    return {"kind": "spline", "breaks": motion.breaks, "coefficients": coefficients}
 
 
 def _point(path: PointPath) -> dict[str, Any] | None:

@@ -194,10 +194,11 @@ def _controller_unit(mechanism: Mechanism, key: str, component: str) -> str:
         key, _, component = component.partition(".")
     if key == "desired":
         component, _, key = component.rpartition(".")
-    viscous = [VISCOUS[unit] for unit in q]
+    viscous, rates = [VISCOUS[unit] for unit in q], [f"{unit}/s" for unit in q]
     by_coordinate = {
         "K_P": [STIFF[unit] for unit in q], "K_V": viscous, "K_D": viscous, "Lambda": ["1/s"] * len(q), "q_d": q,
-        "offset": q, "resolution": q, "q_noise": q, "q_dot_noise": [f"{unit}/s" for unit in q],
+        "offset": q, "rate": rates, "max_rate": rates, "max_acceleration": [f"{unit}/s²" for unit in q],
+        "resolution": q, "q_noise": q, "q_dot_noise": rates,
     }  # fmt: skip
     by_motor = {"torque_limit": tau, "preload": tau, "torque_resolution": tau,
                 "torque_rate": [f"{unit}/s" for unit in tau]}  # fmt: skip

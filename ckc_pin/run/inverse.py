@@ -22,7 +22,7 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import RecordedTorques, Tracking
-from ckc_pin.control.desired import Desired
+from ckc_pin.control.desired import Desired, find_rate_jump
 from ckc_pin.control.workspace import find_workspace_exit
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
@@ -223,6 +223,12 @@ def _prescribed_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation)
         )
     at = find_start(mechanism, scene).at
     desired = controller.desired if isinstance(controller, Tracking) else _rest_at(controller.q_d)
+    jump = find_rate_jump(desired, scene.spec.t_end)
+    if jump is not None:
+        raise InputError(
+            f"{scene.name}: controller.desired: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
+            'take the profile "trapezoidal", "cubic" or "quintic" instead of "linear"'
+        )
     previous_t: float | None = None
     for t in scene.output_instants().tolist():
         q_d, q_d_dot, q_d_ddot = desired(t)

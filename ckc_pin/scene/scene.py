@@ -126,6 +126,14 @@ class Scene(HasSummary):
         return times
 
 
+def _describe_desired(desired: dict[str, Any]) -> str:
+    """Return the file or the point that a desired motion comes from, or the coordinates that it names."""
+    for key in ("point", "file"):
+        if isinstance(desired.get(key), str):
+            return f"the {key} {desired[key]}"
+    return ", ".join(desired)
+
+
 def _describe_controller(spec: ControllerSpec | None) -> str:
     match spec:
         case None:
@@ -133,7 +141,7 @@ def _describe_controller(spec: ControllerSpec | None) -> str:
         case SetPointSpec():
             return f"set point, K_P = {spec.K_P}, K_V = {spec.K_V}"
         case TrackingSpec():
-            return f"tracking, Lambda = {spec.Lambda}, K_D = {spec.K_D}, of {', '.join(spec.desired)}"
+            return f"tracking, Lambda = {spec.Lambda}, K_D = {spec.K_D}, of {_describe_desired(spec.desired)}"
         case TorquesSpec():
             return f"torques of {spec.file}"
 

@@ -18,7 +18,7 @@ import msgspec
 
 from ckc_pin.base.toml import describe_type
 from ckc_pin.control.point_path import PointPathSpec
-from ckc_pin.control.spec import HarmonicsSpec, TrackingSpec
+from ckc_pin.control.spec import MotionSpec, TableSpec, TrackingSpec
 from ckc_pin.ensembles.spec import SweepSpec
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.scene.spec import SceneSpec
@@ -27,9 +27,9 @@ __all__ = ["FILES", "Key", "Table", "markdown", "tables"]
 
 FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec, "sweep": SweepSpec}
 # Tables without a fixed structure: their contents decide which structure is read.
-OPEN = {(TrackingSpec, "desired"): (HarmonicsSpec, PointPathSpec)}
+OPEN = {(TrackingSpec, "desired"): (MotionSpec, TableSpec, PointPathSpec)}
 # Suffix of the path of such a table.
-PLACES: dict[Any, str] = {HarmonicsSpec: ".COORDINATE"}
+PLACES: dict[Any, str] = {MotionSpec: ".COORDINATE"}
 
 
 @dataclass(frozen=True)

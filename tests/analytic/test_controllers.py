@@ -10,15 +10,15 @@ import pytest
 from ckc_pin import InputError, load
 from ckc_pin.control import Harmonics, SetPoint, Tracking
 from ckc_pin.control.controllers import ControllerModel
-from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.control.spec import MotionSpec
 from ckc_pin.dynamics import Terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, Array, Q, complex_step, desired, set_point, tracking
 from tests.conftest import Pair, assert_close
 
 EQ_21 = Harmonics(
     [
-        HarmonicsSpec(harmonics=[(np.pi / 3, 1.0, 0.0)]),
-        HarmonicsSpec(offset=np.pi / 4, harmonics=[(np.pi / 4, 1.0, -np.pi / 2)]),
+        MotionSpec(harmonics=[(np.pi / 3, 1.0, 0.0)]),
+        MotionSpec(offset=np.pi / 4, harmonics=[(np.pi / 4, 1.0, -np.pi / 2)]),
     ]
 )
 LAMBDA, K_D = np.array([[1.5, 0.0], [0.0, 2.0]]), np.array([[10.0, 0.0], [0.0, 7.0]])

@@ -5,7 +5,7 @@ import pytest
 
 from ckc_pin import load
 from ckc_pin.control.desired import Desired, Harmonics, Table, count_cycles
-from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.control.spec import MotionSpec
 from ckc_pin.control.workspace import follow_desired
 from tests.analytic.five_bar import FIVE_BAR
 
@@ -16,7 +16,7 @@ EDGE = float(
 
 def opposite_swings(swing: float, frequency: float) -> Harmonics:
     waves = ([(sign * swing, frequency, 0.0)] for sign in (-1, 1))
-    return Harmonics([HarmonicsSpec(offset=-np.pi / 2, harmonics=wave) for wave in waves])
+    return Harmonics([MotionSpec(offset=-np.pi / 2, harmonics=wave) for wave in waves])
 
 
 @pytest.mark.parametrize("turns", [3.3, 100.0, 1000.0])

@@ -111,7 +111,11 @@ TRAJECTORY = [
     _value("desired.theta_1=3", f"{DESIRED}.theta_1 = 3: expected a table, got an integer"),
     _value("desired.theta_2.offset=1.0", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_2' is none"),
     _value("desired={theta_1={offset=0.1}}", f"{DESIRED}: needs a table for each of {JOINTS}", "'theta_3' is missing"),
-    _value("desired.theta_1.harmnics=[]", f"{DESIRED}.theta_1: unknown key 'harmnics'; valid: offset, harmonics"),
+    _value(
+        "desired.theta_1.harmnics=[]",
+        f"{DESIRED}.theta_1: unknown key 'harmnics'; valid: ",
+        "rate, harmonics, waypoints",
+    ),
     _value("desired.theta_1.offset=a", f"{DESIRED}.theta_1.offset = 'a': expected a number"),
     _value("desired.theta_1.offset=nan", f"{DESIRED}.theta_1.offset = nan: {FINITE}"),
     _value("desired.theta_1.harmonics=[1.0, 2.0, 3.0]", f"{DESIRED}.theta_1.harmonics[0] = 1.0: expected a list"),
@@ -119,12 +123,18 @@ TRAJECTORY = [
         "desired.theta_1.harmonics=[[1.0, 2.0]]", ".harmonics[0] = [1.0, 2.0]: expected a list of 3, got a list of 2"
     ),
     _value("desired.file=way.csv", f"{DESIRED}: either file", f"or a table for each of {JOINTS}"),
-    _value("desired={file=3}", f'{DESIRED}: either file = "NAME.csv" alone'),
+    _value("desired={file=3}", f'{DESIRED}: either file = "NAME.csv", alone or with interpolation'),
     _value('desired={file="way.csv"}', "bar/way.csv: no such"),
     _csv("empty", "", "way.csv: it is empty", "columns t, theta_1, theta_3"),
     _csv("other columns", "time,theta_1,theta_3\n", "its header is 'time,theta_1,theta_3'", "t, theta_1, theta_3"),
     _csv("a column twice", "t,theta_1,theta_1\n", "its header is 't,theta_1,theta_1'"),
-    _csv("too short", _rows(*_way(last=4)), "way.csv: 5 rows; a smooth trajectory needs at least 6"),
+    _csv(
+        "too short",
+        _rows(*_way(last=4)),
+        "way.csv: 5 rows; without the key interpolation",
+        '"linear", "cubic" or "quintic"',
+        "needs at least 6",
+    ),
     _csv("a word", _rows(*_way(), "11,b,3"), "way.csv, line 13: '11,b,3' is not 3 finite numbers"),
     _csv("a missing cell", _rows(*_way(last=5), "", "6,1"), "way.csv, line 9: '6,1' is not 3 finite numbers"),
     _csv("one number", _rows(*_way(last=5), "6"), "way.csv, line 8: '6' is not 3 finite numbers"),
@@ -137,6 +147,80 @@ TRAJECTORY = [
 ]
 
 
-@pytest.mark.parametrize("case", [*GAINS, *CONTROLLER, *TRAJECTORY], ids=lambda case: case.what)
+def _motion(table: str, *says: str) -> Bad:
+    return Bad(table, _tracking(f"desired.theta_1={{{table}}}"), (f"error: {DESIRED}.theta_1", *says))
+
+
+def _point(keys: str, *says: str) -> Bad:
+    return Bad(f"point: {keys}", _tracking(f'desired={{point="tip", {keys}}}'), (f"error: {DESIRED}", *says))
+
+
+WAY = "waypoints=[[0.0, 0.0], [1.0, 1.0]]"
+LIMITS = "max_rate=2.0, max_acceleration=5.0"
+PLACES = "waypoints=[[0.0, [0.15, -0.42, 0.0]], [1.0, [0.16, -0.42, 0.0]]]"
+
+MOTIONS = [
+    _motion('rate="fast"', ".rate = 'fast': expected a number, got a string"),
+    _motion("rate=inf", f".rate = inf: {FINITE}"),
+    _motion("rte=1.0", "unknown key 'rte'", "rate", "did you mean 'rate'?"),
+    _motion("waypoints=3", ".waypoints = 3: expected a list, got an integer"),
+    _motion("waypoints=[]", ".waypoints: got 0; at least two waypoints are needed"),
+    _motion("waypoints=[[0.0, 1.0]]", ".waypoints: got 1; at least two waypoints are needed"),
+    _motion("waypoints=[[0.0, 1.0], [1.0]]", ".waypoints[1] = [1.0]: expected a list of 2, got a list of 1"),
+    _motion("waypoints=[[0.0, 1.0], [nan, 1.0]]", f".waypoints[1][0] = nan: {FINITE}"),
+    _motion(
+        "waypoints=[[0.0, 1.0], [2.0, 1.0], [1.0, 1.0]]", ".waypoints[2]: t = 1 after t = 2; the times must increase"
+    ),
+    _motion("waypoints=[[0.0, 1.0], [0.0, 2.0]]", ".waypoints[1]: t = 0 after t = 0; the times must increase"),
+    _motion("waypoints=[[0.0, 1e308], [1e-8, -1e308]]", ".waypoints: the numbers are too large"),
+    _motion(f'{WAY}, profile="septic"', ".profile = 'septic'; valid: 'cubic', 'linear', 'quintic', 'trapezoidal'"),
+    _motion('profile="linear"', ": profile belongs to waypoints, which are missing"),
+    _motion(f'{WAY}, profile="trapezoidal", max_rate=1.0', ": profile =", "max_acceleration is missing"),
+    _motion(f'{WAY}, profile="trapezoidal"', "needs max_rate and max_acceleration; max_rate is missing"),
+    _motion(f"{WAY}, max_rate=1.0", 'max_rate belongs to profile = "trapezoidal", not to "quintic"'),
+    _motion(f'{WAY}, profile="cubic", {LIMITS}', 'max_rate belongs to profile = "trapezoidal", not to "cubic"'),
+    _motion("max_rate=1.0", ": max_rate belongs to waypoints, which are missing"),
+    _motion(
+        f'{WAY}, profile="trapezoidal", max_rate=0.0, max_acceleration=1.0',
+        ".max_rate = 0.0: expected a number greater",
+    ),
+    _motion(
+        f'{WAY}, profile="trapezoidal", max_rate=1.25, max_acceleration=5.0',
+        ".waypoints: the distance of 1 from t = 0 s to t = 1 s takes at least 1.05 s with max_rate = 1.25 and "
+        "max_acceleration = 5; allow more time or raise the limits",
+    ),
+    _motion(
+        f'{WAY}, profile="trapezoidal", max_rate=9.0, max_acceleration=1.0', "takes at least 2 s with max_rate = 9"
+    ),
+    _point("file='a.csv', line=1", "line = 1: expected a table"),
+    _point("interpolation='linear'", "point needs exactly one of file, circle, line and waypoints, got []"),
+    _point(f"{PLACES}, interpolation='linear'", "interpolation belongs to file, not to waypoints"),
+    _point(f"{PLACES}, profile='trapezoidal', max_rate=1.0", "max_acceleration is missing"),
+    _point(f"{PLACES}, max_rate=1.0", 'max_rate belongs to profile = "trapezoidal"'),
+    _point(
+        f"{PLACES}, profile='trapezoidal', max_rate=0.005, max_acceleration=1.0",
+        ".waypoints: the distance of 0.01 from t = 0 s to t = 1 s takes at least 2.005 s",
+    ),
+    Bad(
+        "point: two coordinates",
+        _tracking("desired={point='tip', waypoints=[[0.0, [1.0, 0.0]], [1.0, [0.0, 0.0]]]}"),
+        ("controller.desired.waypoints[0][1] = [1.0, 0.0]: expected a list of 3",),
+    ),
+    Bad(
+        "another interpolation",
+        _tracking('desired={file="way.csv", interpolation="spline"}'),
+        (f"{DESIRED}.interpolation = 'spline'; valid: 'cubic', 'linear', 'quintic'",),
+        files={"bar/way.csv": _rows(*_way())},
+    ),
+    Bad(
+        "one row",
+        _tracking('desired={file="way.csv", interpolation="linear"}'),
+        ("way.csv: 1 rows; interpolation needs at least 2",),
+        files={"bar/way.csv": _rows(*_way(last=0))},
+    ),
+]
+
+
+@pytest.mark.parametrize("case", [*GAINS, *CONTROLLER, *TRAJECTORY, *MOTIONS], ids=lambda case: case.what)
 def test_bad_controller(case: Bad, bar: Path) -> None:
     expect(case, bar)

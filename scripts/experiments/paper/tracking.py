@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.desired import Harmonics
-from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.control.spec import MotionSpec
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
@@ -190,7 +190,7 @@ def _yes(answer: bool) -> str:
 
 def accepted(Lambda: Array, K_D: Array) -> bool:
     """Whether `Tracking` accepts the gains."""
-    desired = Harmonics([HarmonicsSpec(), HarmonicsSpec()])
+    desired = Harmonics([MotionSpec(), MotionSpec()])
     try:
         Tracking(Lambda, K_D, desired)
     except InputError:

@@ -7,7 +7,7 @@ import pytest
 
 from ckc_pin import Mechanism, load
 from ckc_pin.control.desired import Harmonics
-from ckc_pin.control.spec import HarmonicsSpec
+from ckc_pin.control.spec import MotionSpec
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import assembly_branches, sigma
 from ckc_pin.mechanism.configuration import Kinematics
@@ -65,7 +65,7 @@ def test_other_branch_has_mirrored_bounds(five_bar: Pair, bounds: dict[float, Bo
 def test_bound_along_trajectory_equals_numpy_five_bar(five_bar: Pair) -> None:
     mechanism, _ = five_bar
     waves = [(np.pi / 3, 1.0, 0.0)], [(np.pi / 4, 1.0, -np.pi / 2)]
-    desired = Harmonics([HarmonicsSpec(harmonics=waves[0]), HarmonicsSpec(offset=np.pi / 4, harmonics=waves[1])])
+    desired = Harmonics([MotionSpec(harmonics=waves[0]), MotionSpec(offset=np.pi / 4, harmonics=waves[1])])
     times = np.linspace(0, 2 * np.pi, 100)
     gradients = [five_bar_gradient(desired(t)[0], 1e-3) for t in times]
     bound = bound_along(mechanism, desired, times)
