@@ -61,8 +61,10 @@ def follow_desired(
         A configuration of the assembly branch; default: the assembled configuration.
     """
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_CYCLE * min(count_cycles(desired, t_end), MAX_SAMPLES))))
+    times = np.linspace(0.0, t_end, samples + 1)
     corners = np.asarray(getattr(desired, "corners", ()))  # extreme positions may be there
-    times = np.union1d(np.linspace(0.0, t_end, samples + 1), corners[(corners > 0.0) & (corners < t_end)])
+    if len(corners) + samples <= MAX_SAMPLES:
+        times = np.union1d(times, corners[(corners > 0.0) & (corners < t_end)])
     times = times[: MAX_SAMPLES + 1]
     first = sigma(mechanism, desired(0.0)[0], start)
     if first.verdict != "converged":

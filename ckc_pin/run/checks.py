@@ -121,7 +121,7 @@ def desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None, t_end: 
     warnings = []
     if desired.until < t_end:
         warnings.append(
-            f"the desired trajectory was checked up to t = {desired.until:.5g} s only, because it oscillates too fast; "
+            f"the desired trajectory was checked up to t = {desired.until:.5g} s only, because it oscillates or turns too fast; "
             "it may leave the workspace later"
         )
     usual = mechanism.assembled.sigma_min()

@@ -227,7 +227,7 @@ def _prescribed_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation)
     if jump is not None:
         raise InputError(
             f"{scene.name}: controller.desired: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
-            'take the profile "trapezoidal", "cubic" or "quintic" instead of "linear"'
+            'take another profile, or interpolation, than "linear"'
         )
     previous_t: float | None = None
     for t in scene.output_instants().tolist():

@@ -218,7 +218,7 @@ def test_interpolated_knots_equal_the_path(name, desired, t_end):
 @pytest.mark.parametrize(
     ("desired", "says"),
     [
-        ({}, "needs exactly one of file, circle and line"),
+        ({}, "needs exactly one of file, circle, line and waypoints"),
         ({"circle": CIRCLE, "line": {"start": [0, 0, 0], "end": [1, 0, 0], "frequency": 1.0}}, "needs exactly one of"),
         ({"circle": {**CIRCLE, "radius": -1.0}}, "radius"),
         ({"circle": {**CIRCLE, "normal": [0, 0, 0]}}, "normal must not be zero"),
