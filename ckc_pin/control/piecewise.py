@@ -72,6 +72,12 @@ class PiecewisePolynomial:
             x = x * s + c[piece]
         return x, x_dot, x_ddot
 
+    @property
+    def constant_rate(self) -> Array | None:
+        """The rate of a motion that turns or moves at a constant one, shape (d,); None for any other motion."""
+        is_line = len(self.coefficients) == 2 and len(self.breaks) == 2
+        return self.coefficients[0, 0] if is_line and np.isinf(self.end) else None
+
 
 def line(start: Array, rate: Array) -> PiecewisePolynomial:
     """Return start + rate t. A rate of an angle, in rad/s, is the frequency of what depends on the angle."""

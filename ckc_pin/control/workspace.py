@@ -17,6 +17,7 @@ __all__ = ["DesiredCheck", "find_workspace_exit", "follow_desired"]
 MIN_SAMPLES = 1000
 SAMPLES_PER_CYCLE = 32  # of the fastest wave: linear interpolation between them has an error of 0.5 %
 MAX_SAMPLES = 10_000  # some seconds of computing time
+POSITION_TOLERANCE = 1e-6  # rad, m, and relative: of the position after a turn
 MAX_MINIMA = 5  # local minima of the singular value that are refined
 BISECTIONS = 50  # to 1e-15 of a sample interval
 
@@ -60,6 +61,27 @@ def follow_desired(
     start : Kinematics, optional
         A configuration of the assembly branch; default: the assembled configuration.
     """
+    turn = _turn_duration(mechanism, desired)
+    if turn < t_end:
+        check, returns = _follow(mechanism, desired, turn, start)
+        if returns or check.leaves_at is not None:
+            return replace(check, until=t_end) if check.leaves_at is None else check
+    return _follow(mechanism, desired, t_end, start)[0]
+
+
+def _turn_duration(mechanism: Mechanism, desired: Desired) -> float:
+    """Return the duration of a turn, s, of a motion with constant rates that repeats itself; infinite for any other."""
+    rates = getattr(desired, "constant_rate", None)
+    if rates is None or np.any(rates[mechanism.tree.in_metres[mechanism.partition.q]]):
+        return np.inf
+    speeds = np.unique(np.abs(rates[rates != 0.0]))
+    return 2 * np.pi / float(speeds[0]) if len(speeds) == 1 else np.inf
+
+
+def _follow(
+    mechanism: Mechanism, desired: Desired, t_end: float, start: Kinematics | None
+) -> tuple[DesiredCheck, bool]:
+    """Follow a trajectory until t_end (s); also return whether the configuration at the end is that at the start."""
     samples = max(MIN_SAMPLES, int(np.ceil(SAMPLES_PER_CYCLE * min(count_cycles(desired, t_end), MAX_SAMPLES))))
     times = np.linspace(0.0, t_end, samples + 1)
     corners = np.asarray(getattr(desired, "corners", ()))  # extreme positions may be there
@@ -68,16 +90,24 @@ def follow_desired(
     times = times[: MAX_SAMPLES + 1]
     first = sigma(mechanism, desired(0.0)[0], start)
     if first.verdict != "converged":
-        return DesiredCheck(0.0, 0.0, 0.0, 0.0)
+        return DesiredCheck(0.0, 0.0, 0.0, 0.0), False
     at, t_at = first.at, 0.0
     path = [(0.0, at.sigma_min(), at)]
     for t in times[1:]:
         moved = _move(mechanism, at, desired, float(t))
         if moved is None:
-            return find_workspace_exit(mechanism, desired, at, t_at, float(t))
+            return find_workspace_exit(mechanism, desired, at, t_at, float(t)), False
         at, t_at = moved, float(t)
         path.append((t_at, at.sigma_min(), at))
-    return _find_closest(mechanism, desired, path)
+    return _find_closest(mechanism, desired, path), _is_same_position(mechanism, path[0][2], at)
+
+
+def _is_same_position(mechanism: Mechanism, one: Kinematics, other: Kinematics) -> bool:
+    """Return whether two configurations are the same up to whole turns of their joints."""
+    tree = mechanism.tree
+    difference = tree.to_coordinates(other.q_tree) - tree.to_coordinates(one.q_tree)
+    turns = np.where(tree.in_metres, 0.0, 2 * np.pi * np.round(difference / (2 * np.pi)))
+    return bool(np.all(np.abs(difference - turns) <= POSITION_TOLERANCE * np.maximum(1.0, np.abs(difference))))
 
 
 def _move(

@@ -121,8 +121,8 @@ def desired_warnings(mechanism: Mechanism, desired: DesiredCheck | None, t_end: 
     warnings = []
     if desired.until < t_end:
         warnings.append(
-            f"the desired trajectory was checked up to t = {desired.until:.5g} s only, because it oscillates or turns too fast; "
-            "it may leave the workspace later"
+            f"the desired trajectory was checked up to t = {desired.until:.5g} s only, because it oscillates or turns "
+            "too fast; it may leave the workspace later"
         )
     usual = mechanism.assembled.sigma_min()
     if desired.sigma_min < SIGMA_MIN_WARNING_FRACTION * usual:

@@ -368,6 +368,16 @@ def test_workspace_check_sees_waypoints_that_leave_and_turns_between_samples() -
     assert inside.until == 3.5
 
 
+def test_workspace_check_follows_one_turn_of_a_crank_for_any_number_of_them() -> None:
+    mechanism = load("slider_crank")
+    motion = make_desired({"crank": {"offset": 0.3, "rate": -300.0}}, mechanism, Sources("it.scene.toml", None), 1e4)
+    check = follow_desired(mechanism, motion, 1e4)
+    assert check.leaves_at is None
+    assert check.until == 1e4
+    assert_close(np.cos(0.3 - 300.0 * check.closest_t), 0, 1e-6)  # the rod is steepest
+    assert 0.0 < check.closest_t < 2 * np.pi / 300.0
+
+
 def test_inverse_dynamics_of_a_trapezoid_matches_the_formulas_and_a_rate_that_jumps_is_refused() -> None:
     overrides = {**scene(spec("trapezoidal")), "solver.output_dt": 0.13}
     forces = ckc_pin.inverse_dynamics("five_bar/tracking", overrides)
