@@ -17,8 +17,8 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import FileStruct, convert
 from ckc_pin.control.desired import Harmonics, Sum, Table, read_desired, read_table
-from ckc_pin.control.piecewise import Interpolation, PiecewisePolynomial, pass_waypoints
-from ckc_pin.control.spec import WaypointsSpec, require_profile
+from ckc_pin.control.piecewise import Interpolation, PiecewisePolynomial, Profile, pass_waypoints
+from ckc_pin.control.spec import Limit, require_profile
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
 from ckc_pin.mechanism.batch import difference_many, integrate_many
@@ -99,7 +99,7 @@ class LineSpec(FileStruct, frozen=True):
     frequency: float
 
 
-class PointPathSpec(WaypointsSpec, frozen=True):
+class PointPathSpec(FileStruct, frozen=True):
     """`[controller.desired]` with `point` in it, and one of file, circle, line and waypoints.
 
     Attributes
@@ -122,6 +122,9 @@ class PointPathSpec(WaypointsSpec, frozen=True):
     waypoints : s, m
         ``[t, [x, y, z]]`` each, at least two; the position is held before the first and after the last.
         ``waypoints = [[0.0, [0.1, -0.4, 0.0]], [1.0, [0.2, -0.4, 0.0]]]``
+    profile
+        Of the motion between waypoints; ``"quintic"`` if absent.
+        ``profile = "linear"``
     max_rate : m/s
         Limit of the speed along the straight line, of ``profile = "trapezoidal"`` only.
         ``max_rate = 0.5``
@@ -136,6 +139,9 @@ class PointPathSpec(WaypointsSpec, frozen=True):
     circle: CircleSpec | None = None
     line: LineSpec | None = None
     waypoints: list[tuple[float, Vector3]] | None = None
+    profile: Profile | None = None
+    max_rate: Limit | None = None
+    max_acceleration: Limit | None = None
 
 
 class Circle:

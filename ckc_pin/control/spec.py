@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, Protocol, cast
 
 import msgspec
 import numpy as np
@@ -20,13 +20,14 @@ __all__ = [
     "DriveSpec",
     "FeedbackSpec",
     "Gain",
+    "Limit",
     "MotionSpec",
     "SensorSpec",
     "SetPointSpec",
     "TableSpec",
     "TorquesSpec",
     "TrackingSpec",
-    "WaypointsSpec",
+    "Waypoints",
     "gain_matrix",
     "require_positive_definite",
     "require_profile",
@@ -220,28 +221,27 @@ FeedbackSpec = SetPointSpec | TrackingSpec
 ControllerSpec = SetPointSpec | TrackingSpec | TorquesSpec
 
 
-class WaypointsSpec(FileStruct, frozen=True, kw_only=True):
-    """How a motion passes its waypoints.
+class Waypoints(Protocol):
+    """The keys of a table that describe a motion through waypoints."""
 
-    Attributes
-    ----------
-    profile
-        Of the motion between waypoints; ``"quintic"`` if absent.
-        ``profile = "trapezoidal"``
-    max_rate : rad/s, m/s
-        Limit of the rate, of ``profile = "trapezoidal"`` only.
-        ``max_rate = 2.0``
-    max_acceleration : rad/s², m/s²
-        Acceleration at the beginning and at the end of each piece, of ``profile = "trapezoidal"`` only.
-        ``max_acceleration = 8.0``
-    """
+    @property
+    def waypoints(self) -> Sequence[Any] | None:
+        """Pairs of a time and a value or a position."""
 
-    profile: Profile | None = None
-    max_rate: Limit | None = None
-    max_acceleration: Limit | None = None
+    @property
+    def profile(self) -> Profile | None:
+        """The kind of motion between them."""
+
+    @property
+    def max_rate(self) -> float | None:
+        """Limit of a trapezoidal profile, 1/s."""
+
+    @property
+    def max_acceleration(self) -> float | None:
+        """Limit of a trapezoidal profile, 1/s²."""
 
 
-class MotionSpec(WaypointsSpec, frozen=True, kw_only=True):
+class MotionSpec(FileStruct, frozen=True, kw_only=True):
     """Motion of one coordinate: offset + rate t + sum of amplitude sin(frequency t + phase) + waypoints.
 
     Attributes
@@ -258,12 +258,24 @@ class MotionSpec(WaypointsSpec, frozen=True, kw_only=True):
     waypoints : s, rad or m
         ``[t, value]`` each, at least two; the value is held before the first and after the last.
         ``waypoints = [[0.0, 0.0], [1.0, 0.8], [2.0, 0.5]]``
+    profile
+        Of the motion between waypoints; ``"quintic"`` if absent.
+        ``profile = "trapezoidal"``
+    max_rate : rad/s, m/s
+        Limit of the rate, of ``profile = "trapezoidal"`` only.
+        ``max_rate = 2.0``
+    max_acceleration : rad/s², m/s²
+        Acceleration at the beginning and at the end of each piece, of ``profile = "trapezoidal"`` only.
+        ``max_acceleration = 8.0``
     """
 
     offset: float = 0.0
     rate: float = 0.0
     harmonics: list[tuple[float, float, float]] = []
     waypoints: list[tuple[float, float]] | None = None
+    profile: Profile | None = None
+    max_rate: Limit | None = None
+    max_acceleration: Limit | None = None
 
 
 class TableSpec(FileStruct, frozen=True, kw_only=True):
@@ -283,12 +295,12 @@ class TableSpec(FileStruct, frozen=True, kw_only=True):
     interpolation: Interpolation | None = None
 
 
-def require_profile(spec: WaypointsSpec, where: str) -> None:
+def require_profile(spec: Waypoints, where: str) -> None:
     """Raise InputError if the keys about waypoints do not go together. `where` is their table, for messages."""
     limits = {"max_rate": spec.max_rate, "max_acceleration": spec.max_acceleration}
     present = [name for name, value in limits.items() if value is not None]
     missing = [name for name, value in limits.items() if value is None]
-    if getattr(spec, "waypoints", None) is None:
+    if spec.waypoints is None:
         extra = [*(["profile"] if spec.profile is not None else []), *present]
         if extra:
             raise InputError(
