@@ -194,6 +194,8 @@ def _controller_unit(mechanism: Mechanism, key: str, component: str) -> str:
         key, _, component = component.partition(".")
     if key == "desired":
         component, _, key = component.rpartition(".")
+        if not component:  # the path of a point
+            return {"max_rate": "m/s", "max_acceleration": "m/s²"}.get(key, "")
     viscous, rates = [VISCOUS[unit] for unit in q], [f"{unit}/s" for unit in q]
     by_coordinate = {
         "K_P": [STIFF[unit] for unit in q], "K_V": viscous, "K_D": viscous, "Lambda": ["1/s"] * len(q), "q_d": q,

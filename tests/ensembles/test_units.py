@@ -88,6 +88,8 @@ KEYS = {
     "controller.K_P": "N m/rad", "controller.K_V.crank": "N m s/rad", "controller.q_d.crank": "rad",
     "controller.Lambda": "1/s", "controller.torque_limit.push": "N", "controller.sensor.q_dot_noise.crank": "rad/s",
     "controller.sensor.filter": "s", "controller.desired.crank.offset": "rad", "controller.drive.torque_rate": "N m/s",
+    "controller.desired.crank.rate": "rad/s", "controller.desired.crank.max_acceleration": "rad/s²",
+    "controller.desired.max_rate": "m/s",
 }  # fmt: skip
 VARIABLES: dict[str, Any] = {"link.rod_link.mass": [0.2, 0.3], "spring.0.stiffness": [1.0, 2.0]}
 OUTPUTS: dict[str, Any] = {
