@@ -1,4 +1,4 @@
-// Desired trajectories q_d(t) with two derivatives: sums of sines, piecewise polynomials, their sums, or the path of a point.
+// Desired trajectories q_d(t) with two derivatives: sums of sines, piecewise polynomials, sums of both, or a point.
 #pragma once
 
 #include <limits>
