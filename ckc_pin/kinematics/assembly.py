@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,18 +143,23 @@ def _gauss_newton(
     return q
 
 
-def assemble_mechanism(spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
-    """Assemble a mechanism from its files, with overrides of its parameters by name.
+def assemble_mechanism(
+    spec: MechanismSpec,
+    sources: Sources,
+    overrides: Overrides | None = None,
+    prescribed: Mapping[str, float] | None = None,
+) -> Mechanism:
+    """Assemble a mechanism from its files, with overrides of its parameters and positions of prescribed joints by name.
 
     Raises
     ------
     MechanismError
         Unknown names, loops that cannot be closed from q_guess, or unsuitable independent coordinates.
     """
-    linkage = Linkage(spec, sources, overrides)
+    linkage = Linkage(spec, sources, overrides, prescribed)
     tree, closure, size = linkage.tree, linkage.closure, linkage.size
     with one_blas_thread():
-        guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)
+        guess = tree.vector({**spec.q_guess, **(prescribed or {})}, tree.coordinates, "q_guess", fill=0.0)
         closed = _assemble(linkage, tree.from_coordinates(guess))
         lengths = bool(np.all(closure.in_metres(tree)))
         rounding = 1e-13 * (size if lengths else max(size, 1.0))
@@ -208,7 +213,8 @@ def _close_near(linkage: Linkage, start: Array, bounds: tuple[Array, Array] | No
     tree, exact, rounded = linkage.tree, EXACT_TOLERANCE * linkage.size, ROUNDED_TOLERANCE * linkage.size
     if linkage.spec.independent is not None:
         free = np.ones(tree.n)
-        free[tree.indices(tuple(linkage.spec.independent), "independent")] = 0.0
+        held = [name for name in linkage.spec.independent if name not in linkage.prescribed]
+        free[tree.indices(tuple(held), "independent")] = 0.0
         closed = close_loops(tree, linkage.closure, start, free, exact, bounds=bounds, rounded=rounded)
     if closed is None or closed.residual > rounded:
         closed = close_loops(tree, linkage.closure, start, np.ones(tree.n), exact, bounds=bounds, rounded=rounded)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -64,7 +64,11 @@ class MechanismCache:
 cache = MechanismCache(capacity=32)
 
 
-def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -> Mechanism:
+def load(
+    name: str | Path | GeneratorSpec,
+    overrides: Overrides | None = None,
+    prescribed: Mapping[str, float] | None = None,
+) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
     Parameters
@@ -74,6 +78,8 @@ def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -
         number of links.
     overrides : mapping, optional
         Parameter values by name that replace those of the files, such as ``{"link.link_2.mass": 0.3}``.
+    prescribed : mapping, optional
+        Joints that are held at a position, rad or m, by name. Each is a constraint row and takes away a freedom.
 
     Returns
     -------
@@ -88,7 +94,7 @@ def load(name: str | Path | GeneratorSpec, overrides: Overrides | None = None) -
         The mechanism cannot exist as described.
     """
     require_type(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*read_mechanism_texts(name), None if overrides is None else _check_overrides(overrides))
+    return build(*read_mechanism_texts(name), None if overrides is None else _check_overrides(overrides), prescribed)
 
 
 def _check_overrides(overrides: Any) -> Overrides:
@@ -121,24 +127,29 @@ def as_mechanism(mechanism: Any, function: str) -> Mechanism:
     return mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
 
 
-def build(text: str, sources: Sources, overrides: Overrides | None = None) -> Mechanism:
+def build(
+    text: str, sources: Sources, overrides: Overrides | None = None, prescribed: Mapping[str, float] | None = None
+) -> Mechanism:
     """Return the assembled mechanism of a mechanism file. The text of the file is added to its sources.
 
     Parsing, assembly and the rank computation take longer than many runs. A mechanism that was built from the same
     texts is therefore copied from `cache`.
     """
     sources.texts[MECHANISM_FILE] = text
-    key = (text, sources.name, sources.folder, tuple(sorted((overrides or {}).items())))
+    tables = (tuple(sorted((table or {}).items())) for table in (overrides, prescribed))
+    key = (text, sources.name, sources.folder, *tables)
     mechanism = cache.find(key, sources)
     if mechanism is None:
-        mechanism = _build(text, sources, overrides)
+        mechanism = _build(text, sources, overrides, prescribed)
         cache.add(key, mechanism)
     return mechanism
 
 
-def _build(text: str, sources: Sources, overrides: Overrides | None) -> Mechanism:
+def _build(
+    text: str, sources: Sources, overrides: Overrides | None, prescribed: Mapping[str, float] | None
+) -> Mechanism:
     data = read_toml(text, sources.name)
     join_dotted_keys(data, "q_guess")
     spec = convert(data, MechanismSpec, sources.name)
     with sources.prefix_errors():
-        return assemble_mechanism(spec, sources, overrides)
+        return assemble_mechanism(spec, sources, overrides, prescribed)

@@ -147,7 +147,11 @@ def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mappi
         what = load_scene(what, overrides)
     elif overrides:
         raise InputError("linearize: overrides are accepted only with a name or path, not with a Scene or a Mechanism")
-    return _Subject(load_scene_mechanism(what), what) if isinstance(what, Scene) else _Subject(what, None)
+    if not isinstance(what, Scene):
+        return _Subject(what, None)
+    mechanism = load_scene_mechanism(what)
+    mechanism.refuse_prescribed_joints("linearize")
+    return _Subject(mechanism, what)
 
 
 def _require_time(at: Any) -> float:

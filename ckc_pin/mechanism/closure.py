@@ -15,9 +15,10 @@ from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, LoopType
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["Closure", "ClosureBuilder", "perpendicular"]
+__all__ = ["PRESCRIBED_ROW", "Closure", "ClosureBuilder", "perpendicular"]
 
 _XYZ = np.eye(3)
+PRESCRIBED_ROW = "prescribed"  # name of the row of a prescribed joint
 
 # Rows of each loop type: of the position, then of the orientation. r = p_A - p_B; a and b are axis_a and axis_b; e1, e2
 # and a are a right-handed basis; log is the rotation vector of R_A^T R_B.
@@ -244,6 +245,12 @@ class ClosureBuilder:
         coefficients = np.zeros(self.tree.n)
         coefficients[joint], coefficients[other] = 1.0, -coupling.ratio
         self._affine.append((self._add_row(name, "coupling"), coefficients, coupling.offset))
+
+    def add_prescribed(self, joint: str, value: float) -> None:
+        """Add the row joint - value = 0, whose value the native loop moves in time."""
+        coefficients = np.zeros(self.tree.n)
+        coefficients[self.tree.joint_index(joint, "prescribed")] = 1.0
+        self._affine.append((self._add_row(joint, PRESCRIBED_ROW), coefficients, value))
 
     def build(self) -> Closure:
         """Return the closure, with at most one group of each primitive."""

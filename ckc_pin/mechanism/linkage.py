@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from xml.etree import ElementTree
 
 import numpy as np
@@ -47,6 +47,10 @@ class Linkage:
     urdf : UrdfTree
         All trees of the file, merged into one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
+    closed : Closure
+        The rows of loops and couplings, without those of prescribed joints.
+    prescribed : tuple of str
+        Names of the prescribed joints.
     motors : Motors or None
         None if the file names no motors.
     points : dict of str to Frame
@@ -55,7 +59,13 @@ class Linkage:
     warnings : list of str
     """
 
-    def __init__(self, spec: MechanismSpec, sources: Sources, overrides: Overrides | None = None) -> None:
+    def __init__(
+        self,
+        spec: MechanismSpec,
+        sources: Sources,
+        overrides: Overrides | None = None,
+        prescribed: Mapping[str, float] | None = None,
+    ) -> None:
         text, urdf = merge(_tree_texts(spec, sources))
         self.warnings = list(urdf.warnings)
         if overrides:
@@ -74,7 +84,11 @@ class Linkage:
         mimic = [CouplingSpec(joint=a, other=b, ratio=r, offset=c) for a, b, r, c in urdf.mimic]
         for coupling in [*spec.coupling, *mimic]:
             builder.add_coupling(coupling)
-        self.closure: Closure = builder.build()
+        self.closed: Closure = builder.build()
+        for joint, value in (prescribed or {}).items():
+            builder.add_prescribed(joint, value)
+        self.prescribed = tuple(prescribed or ())
+        self.closure: Closure = builder.build() if prescribed else self.closed
         self.joints = Joints(self.tree, spec.joint)
         self.motors = motors_of(spec, self.tree)
         self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)

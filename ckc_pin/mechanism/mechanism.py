@@ -80,6 +80,7 @@ class Mechanism(HasSummary):
         self.q_tree, self.residual, self.tolerance = q_tree, residual, tolerance
         self.freedoms = freedoms
         self.d, self.rank = freedoms.d, freedoms.rank.rank
+        self.prescribed = linkage.prescribed
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
         self._drop_ineffective_friction()
@@ -173,12 +174,19 @@ class Mechanism(HasSummary):
                 raise InputError(f"{what}: {dependent!r} follows from the loops; there are {', '.join(names)}")
         return self.tree.vector(values, names, what, fill)
 
+    def refuse_prescribed_joints(self, function: str) -> None:
+        """Raise InputError if joints are prescribed, for a function that does not support them."""
+        if self.prescribed:
+            raise InputError(
+                f"{function}: prescribed joints ({', '.join(self.prescribed)}) are not supported; remove [[prescribed]]"
+            )
+
     # --- construction ----------------------------------------------------------------------------
 
     def _drop_ineffective_friction(self) -> None:
         """Remove friction and stops of joints that cannot move, where they would act on rounding errors."""
         idle = self.freedoms.immobile & (self.joints.stopped | (self.joints.friction != 0.0))
-        if not idle.any():
+        if not idle.any() or self.prescribed:  # they move with the prescribed joints
             return
         self.joints = self.joints.without(idle)
         names = ", ".join(self.coordinates[k] for k in np.flatnonzero(idle))
@@ -193,7 +201,10 @@ class Mechanism(HasSummary):
         if chosen is None:  # every choice splits the six coordinates of a free root
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
             best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
-        names = list(self.spec.independent) if self.spec.independent is not None else self._prefer_driven(best, motors)
+        if self.spec.independent is not None:
+            names = [name for name in self.spec.independent if name not in self.prescribed]
+        else:
+            names = self._prefer_driven(best, motors)
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
             raise MechanismError(f"independent: a coordinate is named twice in {names}")
@@ -238,6 +249,7 @@ class Mechanism(HasSummary):
         """Take the file's motors, or one on each independent joint. Warn of freedoms that nothing drives or holds."""
         joints = [name for name in self.independent if name not in self.tree.free_coordinates]
         self.motors = Motors.on_joints(self.tree, joints) if motors is None else motors
+        self.motors = self.motors.with_joints(self.tree, self.prescribed)
         self.actuated = self.motors.names
         anchors = [self.closure.anchors, self.springs.anchors]
         shafts = np.vstack([self.motors.transmission, np.diag(self.springs.joint_stiffness)])

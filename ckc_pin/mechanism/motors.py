@@ -66,6 +66,26 @@ class Motors:
         unlimited = np.full(len(at), np.inf)
         return cls(joints, np.eye(tree.n)[at], unlimited, unlimited, "actuated")
 
+    def with_joints(self, tree: Tree, joints: Sequence[str]) -> Motors:
+        """Return these motors and one more, without gear and limits, for each joint that none of them drives alone."""
+        missing = [joint for joint in joints if self.motor_on(tree.index[joint]) is None]
+        if not missing:
+            return self
+        others = Motors.on_joints(tree, missing)
+        return Motors(
+            (*self.names, *others.names),
+            np.vstack([self.transmission, others.transmission]),
+            np.concatenate([self.torque_limit, others.torque_limit]),
+            np.concatenate([self.speed_limit, others.speed_limit]),
+            self.key,
+        )
+
+    def motor_on(self, coordinate: int) -> int | None:
+        """Return the motor that drives this coordinate and no other one, or None."""
+        driven = self.transmission != 0.0
+        alone = np.flatnonzero(driven[:, coordinate] & (driven.sum(axis=1) == 1))
+        return int(alone[0]) if len(alone) else None
+
     def force(self, tau: Array) -> Array:
         """Return the generalized force u' of motor torques on the tree, shape (n,)."""
         return self.transmission.T @ tau

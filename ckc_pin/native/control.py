@@ -29,11 +29,12 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
+from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.tables import closure_table, core_table, packed
 
-__all__ = ["actuation_table", "allocate", "apply_u", "control_table", "law_table"]
+__all__ = ["actuation_table", "allocate", "apply_u", "control_table", "law_table", "prescribed_table"]
 
 QUARTER = math.pi / 2
 TIME_TOLERANCE = 1e-9  # s, and relative to the time: breaks of a desired motion closer than this are one
@@ -142,6 +143,20 @@ def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
     transmission = (actuation.motors.transmission @ terms.rho).T  # u = transmission tau
     tau = allocate(transmission, u, actuation.limit, actuation.weights, actuation.preload)
     return Effort(tau, actuation.motors.force(tau), transmission @ tau)
+
+
+def prescribed_table(mechanism: Mechanism, motion: Desired, *, smooth_friction: bool) -> dict[str, Any]:
+    """Return the table of the prescribed joints of a mechanism: their rows, motors, dry friction and motion."""
+    at = mechanism.tree.indices(mechanism.prescribed, "prescribed")
+    motors = [motor for k in at if (motor := mechanism.motors.motor_on(k)) is not None]
+    return {
+        "rows": [mechanism.closure.names.index((name, PRESCRIBED_ROW)) for name in mechanism.prescribed],
+        "motors": motors,
+        "offset": motion(0.0)[0],
+        "gear": mechanism.motors.transmission[np.array(motors, np.intp), at],
+        "friction": np.zeros(len(at)) if smooth_friction else mechanism.joints.friction[at],
+        "motion": _desired(motion),
+    }
 
 
 def _clock(

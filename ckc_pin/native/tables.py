@@ -95,6 +95,10 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
 
 def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
     joints, n = mechanism.joints, mechanism.n
+    if mechanism.prescribed and not smoothing:  # `prescribed_table` has their friction
+        prescribed = np.zeros(n, dtype=bool)
+        prescribed[mechanism.tree.indices(mechanism.prescribed, "prescribed")] = True
+        joints = joints.without(prescribed)
     moves = smoothing is not None
     return {
         "friction": joints.friction if moves else np.zeros(n),

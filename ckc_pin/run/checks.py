@@ -23,13 +23,14 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation, list_limit_violations
 from ckc_pin.scene.initial import Start, find_start, require_chart
-from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism, prescribed_motion
 from ckc_pin.scene.scene import Scene
 
 __all__ = ["check_desired", "desired_warnings", "limit_warnings", "require_runnable", "run_warnings"]
 
 # A desired motion gets a warning where sigma_min(phi_z) falls below this fraction of its value as assembled.
 SIGMA_MIN_WARNING_FRACTION = 0.1
+PRESCRIBED_SAMPLES = 1001  # instants at which a prescribed motion is compared with the joint's stops
 
 
 def require_runnable(
@@ -57,7 +58,10 @@ def require_runnable(
         with scene.sources.prefix_errors():
             controller.require_sample_count(scene.spec.t_end)
             controller.require_usable_sensor(mechanism)
-    if mechanism.d == 0:
+    if mechanism.prescribed:
+        with scene.sources.prefix_errors():
+            _require_prescribable(scene, mechanism, controller)
+    elif mechanism.d == 0:
         raise InputError(f"{mechanism.name}: the loops leave no freedom (d = 0), so nothing can move")
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
@@ -65,12 +69,56 @@ def require_runnable(
     with scene.sources.prefix_errors():
         if beyond := describe_stop_violation(mechanism, start.at.q_tree):
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within the stops")
-    require_mass(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
+    if mechanism.d:
+        require_mass(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = controller.controller if isinstance(controller, Sampled) else controller
     if law is not None and not is_torque_controller(law):
         require_chart(mechanism, start)
         actuation.require_driven_freedoms(start.at)
     return start
+
+
+def _require_prescribable(
+    scene: Scene, mechanism: Mechanism, controller: Controller | TorqueController | Sampled | None
+) -> None:
+    """Raise InputError if a scene combines prescribed joints with something that does not know them."""
+    spec, names = scene.spec, ", ".join(mechanism.prescribed)
+    if spec.formulation == "spf" and (spec.spf_coordinates == "z" or spec.coriolis_velocity == "actual"):
+        raise InputError(
+            f'prescribed: {names}: the SPF needs spf_coordinates = "w" and coriolis_velocity = "rho" with prescribed '
+            "joints"
+        )
+    law = controller.controller if isinstance(controller, Sampled) else controller
+    if isinstance(law, SetPoint | Tracking):
+        raise InputError(
+            f"prescribed: {names}: the controllers of eqs. 14 and 16 assume loops that do not move by themselves; use "
+            "torques or a controller of your own"
+        )
+    if isinstance(controller, Sampled) and controller.sensor is not None:
+        raise InputError(f"prescribed: {names}: sensors are not supported with prescribed joints; remove the sensor")
+    joints = mechanism.joints
+    limited = np.isfinite(joints.lower) | np.isfinite(joints.upper)
+    sticks = joints.has_events(spec.friction_smoothing) & (joints.stopped | (joints.friction != 0.0))
+    driven = mechanism.freedoms.immobile.copy()
+    driven[mechanism.tree.indices(mechanism.prescribed, "prescribed")] = False
+    if (sticks & driven).any():
+        k = int(np.flatnonzero(sticks & driven)[0])
+        raise InputError(
+            f"prescribed: {names}: {mechanism.coordinates[k]} moves with it alone, so its dry friction and stops "
+            "cannot hold it; give friction_smoothing, or remove its friction and stops"
+        )
+    at = mechanism.tree.indices(mechanism.prescribed, "prescribed")
+    motion, times = prescribed_motion(spec.prescribed), np.linspace(0.0, spec.t_end, PRESCRIBED_SAMPLES)
+    positions = np.array([motion(t)[0] for t in times])
+    for k, name in zip(at, mechanism.prescribed, strict=True):
+        values = positions[:, mechanism.prescribed.index(name)]
+        beyond = (values < joints.lower[k]) | (values > joints.upper[k])
+        if limited[k] and joints.stopped[k] and beyond.any():
+            t = float(times[np.argmax(beyond)])
+            raise InputError(
+                f"prescribed: {name} = {float(values[np.argmax(beyond)]):.6g} at t = {t:.6g} s is beyond its stop; its "
+                f"range is {joints.lower[k]:g} to {joints.upper[k]:g}"
+            )
 
 
 def run_warnings(scene: Scene) -> list[str]:

@@ -122,11 +122,13 @@ def inverse_dynamics(
     with one_blas_thread():
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
+            mechanism.refuse_prescribed_joints("inverse_dynamics")
             actuation = build_scene_actuation(scene, mechanism)
             motion, t_end = _recorded_motion(what, mechanism), float(what.t[-1])
         else:
             scene = what
             mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end
+            mechanism.refuse_prescribed_joints("inverse_dynamics")
             actuation = build_scene_actuation(scene, mechanism)
             motion = _prescribed_motion(scene, mechanism, actuation)
         return _collect_motion(motion, mechanism, actuation, scene.name, t_end, progress)
@@ -327,6 +329,7 @@ class RecordedJoints:
 def compute_loop_forces(run: Run) -> dict[str, Array]:
     """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
     mechanism, recorded_joints = run.mechanism, RecordedJoints(run)
+    mechanism.refuse_prescribed_joints("loop_forces")
     forces = np.empty_like(run.phi)
     for k, numbers in enumerate(run.q_tree):
         at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))

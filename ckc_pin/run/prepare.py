@@ -19,19 +19,20 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
-from ckc_pin.native.control import control_table
+from ckc_pin.native.control import control_table, prescribed_table
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
 from ckc_pin.run.checks import require_runnable
 from ckc_pin.run.compiled_terms import NEVER, select_library
 from ckc_pin.run.events import Event, EventFunction, build_event_functions
 from ckc_pin.run.loop_terms import wrap_controller
-from ckc_pin.scene.initial import Start
+from ckc_pin.scene.initial import Start, prescribed_velocity
 from ckc_pin.scene.parts import (
     apply_sampling,
     build_scene_actuation,
     build_scene_controller,
     load_scene_mechanism,
+    prescribed_motion,
 )
 from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
@@ -135,6 +136,9 @@ class Prepared:
         start = start or self.start
         with np.errstate(over="ignore"):
             v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
+        if self.mechanism.prescribed and start.v_tree is None:
+            rates = prescribed_motion(self.scene.spec.prescribed)(t)[1]
+            v_tree = v_tree + prescribed_velocity(self.mechanism, start.at, rates)
         if not np.all(np.isfinite(v_tree)):
             raise InputError(
                 f"initial.q_dot = {start.q_dot.tolist()}: the rates of the dependent coordinates are not finite"
@@ -190,6 +194,12 @@ def prepare(
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
+    if mechanism.prescribed:
+        formulation["prescribed"] = prescribed_table(
+            mechanism,
+            prescribed_motion(scene.spec.prescribed),
+            smooth_friction=scene.spec.friction_smoothing is not None,
+        )
     sensitivities = None
     if set_up_sensitivities is not None:
         sensitivities = set_up_sensitivities(scene, mechanism, controller, actuation, start)

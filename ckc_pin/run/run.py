@@ -8,6 +8,7 @@ from os.path import isdir, isfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
@@ -25,7 +26,9 @@ from ckc_pin.mechanism.units import joined
 from ckc_pin.run.columns import quantity_units, to_csv_text, to_data_frame, to_dataset
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
 from ckc_pin.run.state import State, recorded_state
+from ckc_pin.scene.parts import prescribed_positions
 from ckc_pin.scene.scene import describe_formulation
+from ckc_pin.scene.spec import PrescribedSpec
 
 if TYPE_CHECKING:
     import pandas
@@ -132,7 +135,9 @@ class Run(HasSummary):
         if simulated is not None:
             return simulated
         overrides = plain_values(self.scene.get("parameters", {}))
-        mechanism = build(self.texts[MECHANISM_FILE], Sources(self.scene_name, None, self.texts), overrides)
+        sources = Sources(self.scene_name, None, self.texts)
+        prescribed = prescribed_positions(msgspec.convert(self.scene.get("prescribed", []), list[PrescribedSpec]))
+        mechanism = build(self.texts[MECHANISM_FILE], sources, overrides, prescribed)
         for attribute in ("coordinates", "independent", "actuated"):
             names, expected = getattr(self, attribute), getattr(mechanism, attribute)
             if names != expected:

@@ -16,6 +16,7 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import Vector3
+from ckc_pin.scene.spec import PrescribedSpec
 
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "hashes_of", "read_run", "write_run"]
 
@@ -81,6 +82,7 @@ class _Scene(msgspec.Struct):
     spf_coordinates: Literal["w", "z"]
     controller: _Controller | None = None
     parameters: dict[str, float | Vector3] = {}
+    prescribed: list[PrescribedSpec] = []
 
 
 class _Cost(msgspec.Struct):

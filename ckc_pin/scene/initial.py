@@ -11,13 +11,14 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import newton, sigma
+from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
 
-__all__ = ["Start", "find_branch", "find_start", "is_chart", "require_chart"]
+__all__ = ["Start", "find_branch", "find_start", "is_chart", "prescribed_velocity", "require_chart"]
 
 # Rounded digits of a configuration that gives every coordinate may leave the loops open by this much: rad, or relative
 # to the mechanism's size.
@@ -113,6 +114,15 @@ def _close_full_configuration(mechanism: Mechanism, values: dict[str, float]) ->
     closed = newton(at, 0.0, mechanism.tolerance)
     moved = mechanism.tree.difference(at.q_tree, closed.at.q_tree) / mechanism.tree.step_scale
     return closed.at if closed.converged and np.abs(moved).max() <= MAX_ROUNDING else None
+
+
+def prescribed_velocity(mechanism: Mechanism, at: Kinematics, rates: Array) -> Array:
+    """Return the velocity of the tree that makes the prescribed joints move at these rates, with q_dot = 0, (n,)."""
+    row_rates, v_tree = np.zeros(mechanism.closure.rows), np.zeros(mechanism.n)
+    for name, rate in zip(mechanism.prescribed, rates, strict=True):
+        row_rates[mechanism.closure.names.index((name, PRESCRIBED_ROW))] = rate
+    v_tree[at.partition.z] = np.linalg.lstsq(at.phi_z, row_rates, rcond=None)[0]
+    return v_tree
 
 
 def find_branch(mechanism: Mechanism, values: dict[str, float]) -> Kinematics:

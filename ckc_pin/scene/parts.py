@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os.path import exists
 from pathlib import Path
 
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
 from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
+from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.scene.initial import find_branch, is_chart
 from ckc_pin.scene.scene import Scene
+from ckc_pin.scene.spec import PrescribedSpec
 
 __all__ = [
     "apply_sampling",
     "build_scene_actuation",
     "build_scene_controller",
     "load_scene_mechanism",
+    "prescribed_motion",
+    "prescribed_positions",
     "rebuild_scene_mechanism",
 ]
 
@@ -39,7 +45,28 @@ def load_scene_mechanism(scene: Scene) -> Mechanism:
 def rebuild_scene_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
     """Load a scene's mechanism with other parameters than the scene's."""
     mechanism = scene.spec.mechanism
-    return load(_resolve_path(scene, mechanism) if isinstance(mechanism, str) else mechanism, overrides)
+    name = _resolve_path(scene, mechanism) if isinstance(mechanism, str) else mechanism
+    return load(name, overrides, prescribed_positions(scene.spec.prescribed))
+
+
+def prescribed_motion(prescribed: Sequence[PrescribedSpec]) -> Harmonics:
+    """Return the motion of prescribed joints over time, in their order."""
+    return Harmonics(prescribed)
+
+
+def prescribed_positions(prescribed: Sequence[PrescribedSpec]) -> dict[str, float]:
+    """Return the positions of the prescribed joints at t = 0 by name, rad or m.
+
+    Raises
+    ------
+    InputError
+        A joint is prescribed twice.
+    """
+    joints = [one.joint for one in prescribed]
+    twice = next((name for k, name in enumerate(joints) if name in joints[:k]), None)
+    if twice is not None:
+        raise InputError(f"prescribed: joint {twice!r} is prescribed twice")
+    return dict(zip(joints, prescribed_motion(prescribed)(0.0)[0].tolist(), strict=True)) if joints else {}
 
 
 def _resolve_path(scene: Scene, name: str) -> str | Path:

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import msgspec
 
 from ckc_pin.base.toml import FileStruct
-from ckc_pin.control.spec import ControllerSpec
+from ckc_pin.control.spec import ControllerSpec, HarmonicsSpec
 from ckc_pin.mechanism.library import GeneratorSpec
-from ckc_pin.mechanism.spec import Vector3
+from ckc_pin.mechanism.spec import Name, Vector3
 
 __all__ = ["EventSpec", "InitialSpec", "Method", "SceneSpec", "SolverSpec", "TermsOf"]
 
@@ -132,6 +132,25 @@ class EventSpec(FileStruct, frozen=True):
     stop: bool = False
 
 
+class PrescribedSpec(HarmonicsSpec, frozen=True, kw_only=True):
+    """A joint whose motion is imposed exactly, as a constraint row in time. `tau` is the torque that this takes.
+
+    Attributes
+    ----------
+    joint
+        The joint. It is no longer an independent coordinate.
+        ``joint = "crank"``
+    offset : rad, m
+        Mean value.
+        ``offset = -1.4``
+    harmonics : rad or m, rad/s, rad
+        Any number of waves, ``[amplitude, frequency, phase]`` each.
+        ``harmonics = [[1.0472, 1.0, 0.0]]``
+    """
+
+    joint: Name
+
+
 class SceneSpec(FileStruct, frozen=True):
     """A scene file: mechanism, formulation, start, solver, controller and events of a run.
 
@@ -174,6 +193,9 @@ class SceneSpec(FileStruct, frozen=True):
     event
         Events that are recorded, or that end the run.
         ``event = [{of = "limit", stop = true}]``
+    prescribed
+        Joints that move as prescribed, whatever torque that takes.
+        ``prescribed = [{joint = "crank", offset = 0.4, harmonics = [[0.5, 2.0, 0.0]]}]``
     """
 
     mechanism: str | GeneratorSpec
@@ -188,3 +210,4 @@ class SceneSpec(FileStruct, frozen=True):
     solver: SolverSpec = SolverSpec()
     controller: ControllerSpec | None = None
     event: list[EventSpec] = []
+    prescribed: list[PrescribedSpec] = []

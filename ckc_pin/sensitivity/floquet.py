@@ -163,6 +163,7 @@ def floquet(
     base = as_scene(scene, overrides, "floquet")
     scene = make_scene(apply_overrides(base.to_dict(), {"t_end": period}), base.name, base.sources)
     mechanism = load_scene_mechanism(scene)
+    mechanism.refuse_prescribed_joints("floquet")
     if root := mechanism.independent_root_coordinates:
         raise InputError(
             f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, whose rotation has no "

@@ -53,6 +53,7 @@ def read_desired(scene: Scene, mechanism: Mechanism) -> DesiredTrajectory:
         The scene has another mechanism, or no desired trajectory.
     """
     scene_mech = load_scene_mechanism(scene)
+    scene_mech.refuse_prescribed_joints("--scene")
     if scene_mech.coordinates != mechanism.coordinates or scene_mech.independent != mechanism.independent:
         raise InputError(f"--scene {scene.name}: its mechanism is {scene_mech.name}, the map's is {mechanism.name}")
     controller = build_scene_controller(scene, mechanism)

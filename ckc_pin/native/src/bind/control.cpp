@@ -8,8 +8,6 @@
 
 namespace ckc {
 
-namespace {
-
 std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int size) {
   const auto kind = get<std::string>(table, "kind");
   if (kind == "harmonics") {
@@ -53,6 +51,8 @@ std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int siz
   return std::make_unique<PointTrajectory>(std::move(task), trajectory_from_table(get<nb::dict>(table, "path"), 3),
                                            get<Indices>(table, "q"), std::move(knots), get<double>(table, "tolerance"));
 }
+
+namespace {
 
 // A user's controller. The function returns an array with u or torques, or a string that says why there is none.
 class CallbackController : public Controller {

@@ -34,6 +34,7 @@ class View : public std::enable_shared_from_this<View> {
 
 std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
                                                   const std::shared_ptr<View>& view);
+std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int size);
 void bind_allocation(nb::module_& m);
 std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view);
 

@@ -41,6 +41,21 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
 
+PrescribedJoints prescribed_from_table(const nb::dict& table, const Core& core, Eigen::Index motors) {
+  PrescribedJoints joints{get<Indices>(table, "rows"),
+                          get<Indices>(table, "motors"),
+                          get<Vector>(table, "offset"),
+                          get<Vector>(table, "gear"),
+                          get<Vector>(table, "friction"),
+                          {}};
+  const auto size = static_cast<int>(joints.rows.size());
+  require_indices(joints.rows, core.constraints.closure.rows, "prescribed rows");
+  require_indices(joints.motors, static_cast<int>(motors), "motors of prescribed joints");
+  for (const Vector* x : {&joints.offset, &joints.gear, &joints.friction}) require(*x, size, "prescribed");
+  joints.trajectory = trajectory_from_table(get<nb::dict>(table, "motion"), size);
+  return joints;
+}
+
 Event event_from_table(const EventTable& table, const Core& core, const std::shared_ptr<View>& view) {
   Event event = table.event;
   require_indices({event.coordinate}, core.n, "event");
@@ -68,6 +83,9 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   loop.core = core_from_table(core);
   auto owned_control = control_from_table(control, *loop.core, loop.view);
   auto system = system_from_table(*loop.core, *owned_control, formulation);
+  if (formulation.contains("prescribed"))
+    system->prescribe(prescribed_from_table(get<nb::dict>(formulation, "prescribed"), *loop.core,
+                                            owned_control->tau.size()));
   std::unique_ptr<SensitivityIntegrand> sensitivities;
   if (formulation.contains("sensitivities"))
     sensitivities = std::make_unique<SensitivityIntegrand>(

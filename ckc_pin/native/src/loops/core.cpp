@@ -101,6 +101,7 @@ void Core::set_configuration(In q_tree_, bool with_inertia) {
   Profile::Entry entry(profile, with_inertia && !compiled ? Profile::D_tree : Profile::phi);
   if (compiled) {
     compiled->evaluate_closure(q_tree, constraints.phi, constraints.J);
+    if (has_row_motion()) constraints.phi -= row_motion.value;
     valid_parts_ = jacobian_of_rows;
     return;
   }
@@ -110,6 +111,7 @@ void Core::set_configuration(In q_tree_, bool with_inertia) {
     tree.set_configuration(q_tree);
   valid_parts_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
   constraints.update(tree, q_tree);
+  if (has_row_motion()) constraints.phi -= row_motion.value;
 }
 
 void Core::set_velocity(In v) {
@@ -123,6 +125,7 @@ void Core::update_tree() {
   if (is_valid(tree_is_set)) return;
   tree.set_configuration(q_tree);
   constraints.update(tree, q_tree);
+  if (has_row_motion()) constraints.phi -= row_motion.value;
   valid_parts_ |= tree_is_set;
 }
 

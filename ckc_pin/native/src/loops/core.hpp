@@ -22,6 +22,11 @@ struct Energy {
   double total() const { return kinetic + potential; }
 };
 
+// Values that rows follow: phi = residual - value. Zero for rows that close loops.
+struct RowMotion {
+  Vector value, rate, acceleration;  // (rows)
+};
+
 struct Scales {
   Vector rows, columns;  // factors that make J dimensionless
   double rank;           // relative size below which a pivot of the scaled J counts as zero
@@ -102,6 +107,9 @@ class Core {
   // --- terms that depend on q' ---
   // Compute phi and the placements. `with_inertia`: also D', in the same sweep through the tree.
   void set_configuration(In q_tree, bool with_inertia = false);
+  // Prescribed motion of rows at the present time. `set_configuration` uses its value. Empty if all rows are constant.
+  RowMotion row_motion;
+  bool has_row_motion() const { return row_motion.value.size() > 0; }
   double tolerance_scale() const { return tree.tolerance_scale(q_tree, scales.columns); }
   // Incremented by `set_configuration`. A caller that remembers it can tell whether the core has moved.
   long configuration_count = 0;
@@ -184,6 +192,8 @@ class Core {
   // not finite.
   bool differentiate(In u_tree, In acceleration);
   DynamicsDerivatives derivatives;
+  // Minimum-norm multipliers lambda of eq. 1 at the core's state, where the tree has this acceleration under u'.
+  void multipliers(In u_tree, In acceleration, Out lambda);
   // Minimum-norm lambda with J^T lambda = force.
   void minimum_norm_multipliers(In force, Out lambda);
   // Solve for derivatives of the acceleration: for each column, D' a = force + J^T lambda and J a = -residual. False

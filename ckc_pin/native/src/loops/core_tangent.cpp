@@ -278,12 +278,16 @@ void Core::minimum_norm_multipliers(In force, Out lambda) {
   lambda = scales.rows.cwiseProduct(transposed_.solve(scales.columns.cwiseProduct(force)));
 }
 
-bool Core::differentiate(In u_tree, In acceleration) {
+void Core::multipliers(In u_tree, In acceleration, Out lambda) {
   compute_bias(), compute_D_tree();
   multiply_D_tree(acceleration, unbalanced_force_);
   unbalanced_force_ += bias_tree - damping_tree - u_tree;
-  lambda_.setZero();
-  minimum_norm_multipliers(unbalanced_force_, lambda_);
+  lambda.setZero();
+  minimum_norm_multipliers(unbalanced_force_, lambda);
+}
+
+bool Core::differentiate(In u_tree, In acceleration) {
+  multipliers(u_tree, acceleration, lambda_);
   derivatives.compute(q_tree, v_tree, acceleration, lambda_);
   return derivatives.force_by_q.allFinite() && derivatives.row_by_q.allFinite();
 }

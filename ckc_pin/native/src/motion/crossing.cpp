@@ -138,8 +138,9 @@ double Crossing::find_zero(const Motion& motion, double t, double accuracy) {
 // Whether the step stays on the constraint manifold. Otherwise it may have jumped over a narrow gap between branches.
 bool Crossing::is_on_manifold() {
   for (int k = 0; k < manifold_checks; ++k) {
-    collocation->evaluate(collocation->t_old + (collocation->t - collocation->t_old) * k / (manifold_checks - 1), y_);
-    if (!system_.set_core_configuration(y_) ||
+    const double t = collocation->t_old + (collocation->t - collocation->t_old) * k / (manifold_checks - 1);
+    collocation->evaluate(t, y_);
+    if (!system_.set_time(t) || !system_.set_core_configuration(y_) ||
         system_.core.constraints.phi.lpNorm<Eigen::Infinity>() > manifold_tolerance_)
       return false;
   }

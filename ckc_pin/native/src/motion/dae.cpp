@@ -32,7 +32,11 @@ void Dae::start(double, In q_tree, In v, In, Out y) {
 void Dae::set_core(In q_tree, bool with_inertia) {
   core.set_configuration(q_tree, with_inertia);
   core.compute_J();
-  core_configuration_ = with_inertia ? core.configuration_count : -1;
+  core_configuration_ = with_inertia ? core.configuration_count : -1, core_time_ = row_time();
+}
+
+bool Dae::is_core_at_state() const {
+  return core_configuration_ == core.configuration_count && core_time_ == row_time() && q_tree_ == core.q_tree;
 }
 
 // Does nothing if the core is already at this configuration.
@@ -40,9 +44,9 @@ bool Dae::set_core_configuration(In y) {
   q_tree_ = y.head(core.tree.nq);
   if (!q_tree_.allFinite()) return false;
   // Compare before normalizing, which could change the last digit again.
-  if (core_configuration_ == core.configuration_count && q_tree_ == core.q_tree) return true;
+  if (is_core_at_state()) return true;
   core.tree.normalize(q_tree_);
-  if (core_configuration_ != core.configuration_count || q_tree_ != core.q_tree) set_core(q_tree_);
+  if (!is_core_at_state()) set_core(q_tree_);
   return true;
 }
 
@@ -56,7 +60,7 @@ bool Dae::motion_rhs(double t, In y, Out y_dot) {
     core.tree.normalize(q_tree_);
     const bool has_force = control.is_active() || core.joints.exerts_force();
     if (has_force && !compute_forces(t, q_tree_, v)) return false;
-    if (core.compiled_acceleration(q_tree_, v, has_force ? applied_force(v) : no_force_, zero_correction_,
+    if (core.compiled_acceleration(q_tree_, v, has_force ? applied_force(v) : no_force_, row_correction_,
                                    y_dot.tail(core.n))) {
       counts.factorizations += 2;
       core.tree.configuration_rate(q_tree_, v, y_dot.head(core.tree.nq));
@@ -84,15 +88,25 @@ bool Dae::evaluate_rate(double t, In v, Out y_dot) {
   const int n = core.n;
   core.set_velocity(v);
   if (!compute_forces(t, core.q_tree, v)) return false;
-  residual_.setZero();
-  if (is_stabilized()) {
-    residual_.noalias() = core.constraints.J * core.v_tree;
-    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.constraints.phi;
-  }
+  residual_ = row_correction_;
+  if (is_stabilized()) add_stabilization(core.v_tree);
   counts.factorizations += 2;
   core.tree.configuration_rate(core.q_tree, v, y_dot.head(core.tree.nq));
   if (!acceleration_with_held_joints(v, residual_, y_dot.tail(n))) return false;
   return finite(y_dot) || fail(RhsFailure::not_finite);
+}
+
+// Baumgarte's terms 2 alpha phi_dot + beta^2 phi, into residual_.
+void Dae::add_stabilization(In v) {
+  phi_dot_.noalias() = core.constraints.J * v;
+  if (core.has_row_motion()) phi_dot_ -= core.row_motion.rate;
+  residual_ += 2 * alpha_ * phi_dot_ + beta_ * beta_ * core.constraints.phi;
+}
+
+// phi_dot at velocity v, into residual_.
+void Dae::set_rate_residual(In v) {
+  residual_.noalias() = core.constraints.J * v;
+  if (core.has_row_motion()) residual_ -= core.row_motion.rate;
 }
 
 // Derivatives with respect to the entries of q'. The rotation of a quaternion is that of its normalized value.
@@ -102,18 +116,15 @@ bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
-  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized())
+  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized() || core.has_row_motion())
     set_core_configuration(y), core.set_velocity(v);
   if (!compute_forces(t, q_tree_, v)) return false;
-  residual_.setZero();
-  if (is_stabilized()) {
-    residual_.noalias() = core.constraints.J * v;
-    residual_ = 2 * alpha_ * residual_ + beta_ * beta_ * core.constraints.phi;
-  }
+  residual_ = row_correction_;
+  if (is_stabilized()) add_stabilization(v);
   if (!acceleration_derivatives(q_tree_, v, residual_)) return System::motion_jacobian(t, y, jacobian, evaluations);
   if (is_stabilized() && core.constraints.closure.rows) {
     DynamicsDerivatives& by = core.derivatives;
-    by.compute(q_tree_, v, eq_1_.a, zero_correction_);  // of the constraint rows, which compiled terms do not compute
+    by.compute(q_tree_, v, eq_1_.a, row_correction_);  // of the constraint rows, which compiled terms do not compute
     const Matrix none = Matrix::Zero(n, n);
     if (!core.solve_acceleration_derivatives(none, 2 * alpha_ * by.rate_by_q + beta_ * beta_ * by.J, stabilization_))
       return false;
@@ -162,7 +173,7 @@ bool Dae::project_onto_manifold(In y) {
     if (largest_entry(residual_) <= tolerance) break;  // redundant rows that contradict each other keep phi large
   }
   velocity = velocity_in(y);
-  residual_.noalias() = core.constraints.J * velocity;
+  set_rate_residual(velocity);
   if (largest_entry(residual_) <= rounding * core.constraints.J.norm() * velocity.norm()) return true;
   if (!closure_step(residual_)) return false;
   velocity += step_;
@@ -170,7 +181,7 @@ bool Dae::project_onto_manifold(In y) {
 }
 
 bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
-  if (!finite(y.head(motion_size))) return false;
+  if (!set_time(t) || !finite(y.head(motion_size))) return false;
   q_tree_ = y.head(core.tree.nq);
   core.tree.normalize(q_tree_);
   set_core(q_tree_, false);
@@ -182,7 +193,7 @@ bool Dae::rate_on_manifold(double t, In y, Out y_dot) {
     // Newton's method converges quadratically: the remaining error is the square of this step.
     if (largest_entry(step_.cwiseQuotient(core.scales.columns)) <= newton_tolerance) break;
   }
-  residual_.noalias() = core.constraints.J * velocity_in(y);
+  set_rate_residual(velocity_in(y));
   if (!core.cheapest_closure_step(residual_, step_)) return false;
   ++counts.factorizations;
   velocity = velocity_in(y) + step_;
@@ -211,7 +222,8 @@ bool Dae::reduce_to_freedoms(In y, Matrix& jacobian) {
   return true;
 }
 
-bool Dae::sync_core(double, In y) {
+bool Dae::sync_core(double t, In y) {
+  if (!set_time(t)) return false;
   if (projects_) {
     if (!project_onto_manifold(y)) return false;
   } else {
@@ -234,15 +246,16 @@ void Dae::move_core_to_last_rhs(In y) {
   v_tree = velocity_in(y);
 }
 
-bool Dae::sync_core_at_last_rhs(double, In y) {
+bool Dae::sync_core_at_last_rhs(double t, In y) {
+  if (!set_time(t)) return false;
   set_core_configuration(y);
   velocity = v_tree = velocity_in(y);
   if (elimination.is_due()) elimination.remember_state(core.q_tree, v_tree, applied_force(v_tree));
   return true;
 }
 
-bool Dae::sync_core_unprojected(double, In y) {
-  if (!set_core_configuration(y)) return false;
+bool Dae::sync_core_unprojected(double t, In y) {
+  if (!set_time(t) || !set_core_configuration(y)) return false;
   velocity = v_tree = velocity_in(y);
   set_q_and_q_dot(core.q_tree, velocity);
   return true;
@@ -259,11 +272,12 @@ void Dae::write_projected_state(Out y) const {
   if (projects_) y.head(core.tree.nq) = core.q_tree, y.segment(core.tree.nq, core.n) = velocity;
 }
 
-Accepted Dae::accept_step(double, Out y, double) {
+Accepted Dae::accept_step(double t, Out y, double) {
+  if (!set_time(t)) return Accepted::rejected;
   elimination.accept_step(core);
   if (!projects_) return Accepted::unchanged;
   set_core_configuration(y);
-  residual_.noalias() = core.constraints.J * velocity_in(y);
+  set_rate_residual(velocity_in(y));
   const double drift_rate = largest_entry(residual_) / (1.0 + largest_entry(velocity_in(y)));
   if (std::max(largest_entry(core.constraints.phi), drift_rate) <= tolerance_ * core.tolerance_scale())
     return Accepted::unchanged;

@@ -21,7 +21,7 @@ class Dae : public System {
   bool set_core_configuration(In y) override;
   Accepted accept_step(double t, Out y, double margin) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
-  bool conserves_energy() const override { return projects_; }
+  bool conserves_energy() const override { return projects_ && !core.has_row_motion(); }
   bool reduce_to_freedoms(In y, Matrix& jacobian) override;
   const Vector& configuration_at_last_rhs() const override { return q_tree_; }
   void move_core_to_last_rhs(In y) override;
@@ -43,12 +43,16 @@ class Dae : public System {
   // the inertia, which disturbs the motion as little as possible.
   bool project_onto_manifold(In y);
   bool closure_step(In residual);  // sets step_
+  void add_stabilization(In v);    // Baumgarte's terms, to residual_
+  void set_rate_residual(In v);    // residual_ = phi_dot
+  bool is_core_at_state() const;
 
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long core_configuration_ = -1;  // core.configuration_count when this object last set the core; -1: without inertia
+  double core_time_ = 0.0;        // `row_time` then
   Vector q_tree_;                 // configuration of the last right-hand side
-  Vector step_, z_step_, residual_, no_force_;
+  Vector step_, z_step_, residual_, no_force_, phi_dot_;
   Matrix stabilization_;
 };
 

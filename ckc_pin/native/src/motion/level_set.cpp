@@ -62,6 +62,7 @@ void LevelSet::update_w(double t) {
 
 bool LevelSet::project_state(double t, In y, double tolerance) {
   const int d = core.d;
+  if (!set_time(t)) return false;
   update_w(t);
   predictor_.predict(t, y.head(d), chart_, core, w, q_tree_);
   if (!project_from_predicted(tolerance)) {
@@ -76,6 +77,10 @@ bool LevelSet::project_state(double t, In y, double tolerance) {
   core.compute_rho();
   q_dot = y.segment(d, d);
   core.multiply_rho(q_dot, v_tree);
+  if (core.has_row_motion()) {  // v' = rho q_dot + what makes the rows follow their motion
+    core.solve_z(core.row_motion.rate, z_);
+    for (size_t k = 0; k < core.z.size(); ++k) v_tree(core.z[k]) += z_(k);
+  }
   velocity = v_tree;
   if (!on_manifold_) {
     core.solve_z(w, z_);
@@ -130,10 +135,10 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   const Vector& force = applied_force(v_tree);
   const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.compiled && !locked;
   has_tree_acceleration_ =
-      compiled && core.compiled_acceleration(core.q_tree, v_tree, force, zero_correction_, a_tree_);
+      compiled && core.compiled_acceleration(core.q_tree, v_tree, force, row_correction_, a_tree_);
   if (compiled && !has_tree_acceleration_) ++counts.general_rhs;
-  if (!has_tree_acceleration_ && (locked || (on_manifold_ && core.uses_mass_levels()))) {
-    if (!acceleration_with_held_joints(v_tree, zero_correction_, a_tree_)) return false;
+  if (!has_tree_acceleration_ && (locked || core.has_row_motion() || (on_manifold_ && core.uses_mass_levels()))) {
+    if (!acceleration_with_held_joints(v_tree, row_correction_, a_tree_)) return false;
     has_tree_acceleration_ = true;
   }
   if (has_tree_acceleration_)
@@ -153,13 +158,13 @@ bool LevelSet::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluatio
   return exists;
 }
 
-// Derivative of eq. 1 at q'(q) and v' = rho(q) q_dot: dq'/dq = rho, dv'/dq_dot = rho, and dv'/dq = rho_dot (plus a
-// bracket term for free roots).
+// Derivative of eq. 1 at q'(q) and v'(q, q_dot): dq'/dq = rho, dv'/dq_dot = rho, and dv'/dq = rho_dot at velocity v'
+// (plus a bracket term for free roots).
 bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   const int d = core.d, n = core.n;
   if (!finite(y) || !project_state(t, y, tolerance_)) return false;
   core.set_velocity(v_tree);
-  if (!compute_control(t) || !acceleration_derivatives(core.q_tree, v_tree, zero_correction_)) return false;
+  if (!compute_control(t) || !acceleration_derivatives(core.q_tree, v_tree, row_correction_)) return false;
   core.compute_J_dot(v_tree);
   rho_dot_.resize(n, d);
   for (int k = 0; k < d; ++k) {

@@ -28,7 +28,7 @@ class LevelSet : public System {
   void add_velocity(Out y, In v) const override;
   void add_displacement(Out y, In step) const override;
   void resume(double t, Out y) override;
-  bool conserves_energy() const override { return on_manifold_; }
+  bool conserves_energy() const override { return on_manifold_ && !core.has_row_motion(); }
   bool return_to_accepted() override;
   // (q', v'), or (q', q_dot) off the manifold while a step resolves the decay of w.
   int full_motion_size() const override { return core.rank ? core.tree.nq + (on_manifold_ ? core.n : core.d) : 0; }

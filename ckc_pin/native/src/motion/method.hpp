@@ -86,7 +86,9 @@ class Method : public Interpolant {
   // After a step was rejected for a disagreement: project its start again, more exactly.
   bool return_to_start();
 
+  // Root mean square of x / scale; zero without entries.
   double norm(In x, const Vector& scale) const {
+    if (!x.size()) return 0.0;
     return std::sqrt((x.array() / scale.array()).square().sum() / static_cast<double>(x.size()));
   }
 

@@ -63,6 +63,8 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   row(at++) = t;
   core.tree.to_coordinates(core.q_tree, row.segment(at, n)), at += n;
   append(system.velocity), append(system.control.u.head(d)), append(system.control.tau.head(actuators));
+  if (system.has_prescribed_joints() && !system.set_prescribed_torques(t, row.segment(at - actuators, actuators)))
+    return false;
   append(core.constraints.phi), append(system.w);
   row(at++) = energy.total();
   row(at++) = core.joints.dissipated_energy(row.segment(1, n));
@@ -71,7 +73,8 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   for (int i = 0; i < m; ++i) {
     max_phi_error = std::max(max_phi_error, std::abs(core.constraints.phi(i) - system.w(i)));
     max_phi_dot_error = std::max(max_phi_dot_error, std::abs(core.constraints.J.row(i).dot(system.velocity) -
-                                                             system.w_decay_rate() * system.w(i)));
+                                                             system.w_decay_rate() * system.w(i) -
+                                                             (core.has_row_motion() ? core.row_motion.rate(i) : 0.0)));
   }
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
   if (system.integrand) system.integrand->fill_record(y, row.tail(width - at));

@@ -11,7 +11,7 @@ System::System(Core& core_, Control& control_, int motion_size_)
     : core(core_), control(control_), motion_size(motion_size_), size(motion_size_) {
   velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.constraints.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
-  applied_force_.setZero(core.n), zero_correction_.setZero(core.constraints.closure.rows),
+  applied_force_.setZero(core.n), row_correction_.setZero(core.constraints.closure.rows),
       locked_drift_.setZero(core.n), locked_correction_.setZero(core.n);
 }
 
@@ -20,12 +20,53 @@ void System::append(Integrand& appended) {
   crosses_singularities = false;  // sensitivities diverge at singular positions
 }
 
+void System::prescribe(PrescribedJoints joints) {
+  prescribed_ = std::move(joints);
+  const int rows = core.constraints.closure.rows;
+  for (Vector* x : {&core.row_motion.value, &core.row_motion.rate, &core.row_motion.acceleration, &lambda_})
+    x->setZero(rows);
+  for (Vector* x : {&row_value_, &row_rate_, &row_acceleration_}) x->setZero(prescribed_.offset.size());
+}
+
+bool System::set_time(double t) {
+  if (!has_prescribed_joints() || t == row_time_) return true;
+  Trajectory& trajectory = *prescribed_.trajectory;
+  if (!trajectory(t, row_value_, row_rate_, row_acceleration_)) {
+    control.failure.message = trajectory.failure;
+    return fail(RhsFailure::no_control);
+  }
+  row_time_ = t;
+  for (Eigen::Index k = 0; k < row_value_.size(); ++k) {
+    const int row = prescribed_.rows[k];
+    core.row_motion.value(row) = row_value_(k) - prescribed_.offset(k);
+    core.row_motion.rate(row) = row_rate_(k);
+    core.row_motion.acceleration(row) = row_acceleration_(k);
+    row_correction_(row) = -row_acceleration_(k);
+  }
+  return true;
+}
+
+bool System::set_prescribed_torques(double t, Out tau) {
+  acceleration_.resize(core.n);
+  if (!acceleration(t, acceleration_)) return false;
+  force_.value = applied_force(velocity);
+  for (size_t i = 0; i < core.joints.locked.size(); ++i)
+    force_.value(core.joints.locked[i]) += core.joints.holding_forces()(static_cast<Eigen::Index>(i));
+  core.multipliers(force_.value, acceleration_, lambda_);
+  for (Eigen::Index k = 0; k < row_rate_.size(); ++k) {
+    const double direction = row_rate_(k) > 0.0 ? 1.0 : row_rate_(k) < 0.0 ? -1.0 : 0.0;
+    tau(prescribed_.motors[k]) +=
+        (lambda_(prescribed_.rows[k]) + direction * prescribed_.friction(k)) / prescribed_.gear(k);
+  }
+  return lambda_.allFinite();
+}
+
 bool System::rhs(double t, In y, Out y_dot) {
-  return motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) && (!integrand || integrand->rates(y, y_dot));
+  return set_time(t) && motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) && (!integrand || integrand->rates(y, y_dot));
 }
 
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  return motion_jacobian(t, y.head(motion_size), jacobian, evaluations);
+  return set_time(t) && motion_jacobian(t, y.head(motion_size), jacobian, evaluations);
 }
 
 const Vector& System::applied_force(In v) {
@@ -53,7 +94,7 @@ bool System::acceleration_derivatives(In q_tree, In v, In correction) {
 
 bool System::acceleration(double t, Out a) {
   core.set_velocity(velocity);
-  return compute_control(t) && acceleration_with_held_joints(velocity, zero_correction_, a);
+  return set_time(t) && compute_control(t) && acceleration_with_held_joints(velocity, row_correction_, a);
 }
 
 bool System::correct_locked_joints(Out y, double tolerance, bool& changed) {

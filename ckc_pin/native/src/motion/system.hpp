@@ -39,12 +39,31 @@ enum class Accepted {
   rejected,   // the coordinates are singular here
 };
 
+// Joints whose motion is prescribed: each is a constraint row, joint - trajectory(t) = 0, whose multiplier is the torque
+// of the motor on that joint.
+struct PrescribedJoints {
+  Indices rows, motors;
+  Vector offset;    // of the rows: value of the trajectory at which their residual is zero
+  Vector gear;      // shaft rate by joint rate of each motor
+  Vector friction;  // of the joints; the motor overcomes it
+  std::unique_ptr<Trajectory> trajectory;
+};
+
 class System {
  public:
   System(Core& core, Control& control, int motion_size);
   virtual ~System() = default;
   // Append an integrand to y. It must outlive this system.
   void append(Integrand& integrand);
+  void prescribe(PrescribedJoints joints);
+  bool has_prescribed_joints() const { return !prescribed_.rows.empty(); }
+  double row_time() const { return has_prescribed_joints() ? row_time_ : 0.0; }  // of the prescribed motion that is set
+  // Replace the torques of the motors on prescribed joints by those that make them move as prescribed, at the core's
+  // state with its control. False if there is no acceleration.
+  bool set_prescribed_torques(double t, Out tau);
+  // Evaluate the prescribed motion of rows at t. Every function below that takes a time calls it. False, with a reason in
+  // `control.failure`, if it is undefined.
+  bool set_time(double t);
 
   // Start at t from a configuration with phi = w and velocity v' (rho q_dot, also off the manifold).
   virtual void start(double t, In q_tree, In v_tree, In w, Out y) = 0;
@@ -114,7 +133,7 @@ class System {
   // Compute the derivatives of that acceleration. The core must be at this state unless the terms are compiled and no
   // joint is locked. `correction` is added to J_dot v. False if the derivatives of the applied force are unknown.
   bool acceleration_derivatives(In q_tree, In v, In correction);
-  bool acceleration_derivatives(In q_tree, In v) { return acceleration_derivatives(q_tree, v, zero_correction_); }
+  bool acceleration_derivatives(In q_tree, In v) { return acceleration_derivatives(q_tree, v, row_correction_); }
   // The derivatives that were computed last, without by_u; null if finite differences have taken their place since.
   const AccelerationDerivatives* eq_1_derivatives() const { return eq_1_is_valid_ ? &eq_1_ : nullptr; }
   // Remove the drift of locked joints beyond `tolerance`, and their rates, from y, which is the core's state. False
@@ -157,13 +176,17 @@ class System {
   // Eq. 1 at the core's state with velocity v, including holding forces. `correction` is added to J_dot v.
   bool acceleration_with_held_joints(In v, In correction, Out a);
 
-  Vector zero_correction_;  // (rows)
+  // J a = -(J_dot v + correction) of eq. 1: minus the prescribed acceleration of rows, (rows)
+  Vector row_correction_;
   AccelerationDerivatives eq_1_;
 
  private:
   bool eq_1_is_valid_ = false;
   std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
-  Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_;
+  PrescribedJoints prescribed_;
+  Vector row_value_, row_rate_, row_acceleration_, lambda_;
+  double row_time_ = std::numeric_limits<double>::quiet_NaN();
+  Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_, acceleration_;
   AppliedForce force_;
   Matrix responses_;
 };

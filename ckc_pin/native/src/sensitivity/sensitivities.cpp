@@ -204,7 +204,8 @@ bool Sensitivities::rates(In v, In a, const Matrix& s, Matrix& s_dot) {
 }
 
 bool Sensitivities::has_compiled_terms() const {
-  return core_.compiled && core_.compiled->has_directional_derivatives() &&
+  // They differentiate eq. 1 without prescribed accelerations.
+  return core_.compiled && !core_.has_row_motion() && core_.compiled->has_directional_derivatives() &&
          table_.directions.rows() == core_.compiled->parameter_count();
 }
 

@@ -1,0 +1,181 @@
+"""Joints whose motion is prescribed: the five-bar with its left crank eliminated by hand, and a driven slider-crank."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin import InputError, Run, Simulator, load_scene, sensitivities, simulate
+from ckc_pin.control.desired import Harmonics
+from ckc_pin.control.spec import HarmonicsSpec
+from tests.analytic.five_bar import FIVE_BAR, Array
+from tests.conftest import assert_close
+
+pytestmark = pytest.mark.usefixtures("either_terms")
+
+FORMULATIONS = ["dae", "reduced", "spf"]
+WAVES = {"offset": -1.4, "harmonics": [[0.3, 5.0, 0.4], [0.05, 13.0, -0.3]]}
+START = {"theta_1": -1.4 + 0.3 * math.sin(0.4) + 0.05 * math.sin(-0.3), "theta_3": -1.7}
+RATE = 0.8  # rad/s, of theta_3 at the start
+
+
+def scene(formulation: str, **overrides: Any) -> dict[str, Any]:
+    return {
+        "formulation": formulation,
+        "t_end": 1.5,
+        "prescribed": [{"joint": "theta_1", **WAVES}],
+        "initial": {"q": START, "q_dot": {"theta_3": RATE}},
+        "solver": {"rtol": 1e-11, "output_dt": 0.05},
+        **overrides,
+    }
+
+
+def left_crank(t: float) -> tuple[float, float, float]:
+    waves = np.array(WAVES["harmonics"])
+    angle = waves[:, 1] * t + waves[:, 2]
+    return (
+        float(WAVES["offset"] + waves[:, 0] @ np.sin(angle)),  # type: ignore[operator]
+        float((waves[:, 0] * waves[:, 1]) @ np.cos(angle)),
+        float(-(waves[:, 0] * waves[:, 1] ** 2) @ np.sin(angle)),
+    )
+
+
+def eliminated(times: Array) -> tuple[Array, Array, Array]:
+    """q', v' and the left crank's torque of the reduced model with the left crank's motion inserted by hand."""
+
+    def state(t: float, y: Array) -> tuple[Array, Array, float, float]:
+        q_1, q_1_dot, q_1_ddot = left_crank(t)
+        q_tree, q_dot = FIVE_BAR.sigma(np.array([q_1, y[0]])), np.array([q_1_dot, y[1]])
+        v_tree = FIVE_BAR.rho(q_tree) @ q_dot
+        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.C(q_tree, v_tree) @ q_dot + FIVE_BAR.h(q_tree)
+        q_3_ddot = (-rest[1] - D[1, 0] * q_1_ddot) / D[1, 1]
+        return q_tree, v_tree, q_3_ddot, D[0] @ [q_1_ddot, q_3_ddot] + rest[0]
+
+    motion = solve_ivp(
+        lambda t, y: [y[1], state(t, y)[2]],
+        (0, times[-1]),
+        [START["theta_3"], RATE],
+        "DOP853",
+        times,
+        rtol=1e-13,
+        atol=1e-14,
+    )
+    states = [state(t, y) for t, y in zip(times, motion.y.T, strict=True)]
+    return tuple(np.array([x[k] for x in states]) for k in (0, 1, 3))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("method", ["auto", "Radau"])
+def test_motion_and_torque_are_those_of_the_problem_with_the_joint_eliminated(formulation: str, method: str) -> None:
+    run = simulate("five_bar/swing", scene(formulation, solver={"rtol": 1e-11, "output_dt": 0.05, "method": method}))
+    q_tree, v_tree, tau = eliminated(run.t)
+    assert run.status == "done"
+    assert run.independent == ("theta_3",)
+    turns = 2 * np.pi * np.round((run.q_tree - q_tree) / (2 * np.pi))
+    assert_close(run.q_tree - turns, q_tree, 1e-9)
+    assert_close(run.v_tree, v_tree, 2e-8)
+    assert_close(run.tau[:, run.actuated.index("theta_1")], tau, 1e-7)
+    assert_close(run["theta_1"], [left_crank(t)[0] for t in run.t], 1e-12)
+    assert run.max_phi < 1e-12
+    assert run.max_phi_dot < 1e-9
+
+
+def test_a_prescribed_joint_costs_no_more_steps_than_the_eliminated_problem() -> None:
+    free = simulate("five_bar/swing", {**scene("reduced"), "prescribed": []})
+    driven = simulate("five_bar/swing", scene("reduced"))
+    assert driven.stats["python_calls"] == 0
+    assert driven.stats["rhs"] <= 1.2 * free.stats["rhs"]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_steps_agree_with_the_run(formulation: str) -> None:
+    run, simulator = simulate("five_bar/swing", scene(formulation)), Simulator("five_bar/swing", scene(formulation))
+    for k in range(1, len(run.t)):
+        state = simulator.step(None, 0.05)
+        assert_close(state.q_tree, run.q_tree[k], 1e-8)
+    simulator.reset(state)
+    assert_close(simulator.state.v_tree, state.v_tree, 1e-9)
+
+
+# --- slider-crank, without any freedom -----------------------------------------------------------
+
+CRANK, ROD = 0.1, 0.3  # m, of the shipped slider-crank
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_driven_slider_crank_follows_its_closed_form(formulation: str) -> None:
+    waves = {"offset": 0.5, "harmonics": [[2.0, 3.0, 0.0]]}
+    overrides = {
+        "formulation": formulation,
+        "prescribed": [{"joint": "crank", **waves}],
+        "t_end": 2.0,
+        "initial": {"at": "assembled"},
+        "solver": {"rtol": 1e-10, "output_dt": 0.05},
+    }
+    run = simulate("slider_crank", overrides)
+    assert (run.status, run.independent) == ("done", ())
+    angle = 0.5 + 2.0 * np.sin(3.0 * run.t)
+    assert_close(run["crank"], angle, 1e-12)
+    place = CRANK * np.cos(angle) + np.sqrt(ROD**2 - (CRANK * np.sin(angle)) ** 2)
+    assert_close(run.points["slider"][:, 0], place, 1e-11)
+    power = run.tau[:, run.actuated.index("crank")] * run.v_tree[:, run.coordinates.index("crank")]
+    fine = simulate("slider_crank", {**overrides, "solver": {"rtol": 1e-10, "output_dt": 1e-3}})
+    work = np.concatenate([[0.0], np.cumsum((fine.tau * fine.motor_rates).sum(axis=1))]) * 1e-3
+    assert np.abs(power).max() > 1.0
+    assert_close(
+        fine.energy[-1] - fine.energy[0],
+        work[-1] - 0.5e-3 * ((fine.tau * fine.motor_rates).sum(axis=1)[[0, -1]]).sum(),
+        1e-4,
+    )
+
+
+def test_saved_run_keeps_the_prescribed_joint(tmp_path: Path) -> None:
+    run = simulate("five_bar/swing", scene("reduced", t_end=0.2))
+    loaded = Run.load(run.save(tmp_path / "run.npz"))
+    assert loaded.mechanism.prescribed == ("theta_1",)
+    assert loaded.mechanism.independent == ("theta_3",)
+    assert_close(loaded.tau, run.tau, 0.0)
+
+
+def test_sensitivities_with_a_prescribed_joint_equal_differences() -> None:
+    name, step = "link.link_4.mass", 1e-6
+    overrides = scene("reduced", t_end=0.6)
+    result = sensitivities("five_bar/swing", [name], overrides)
+    mass = load_scene("five_bar/swing")
+    del mass
+    ends = [
+        simulate("five_bar/swing", {**overrides, "parameters": {name: 0.2352 + side * step}}).q_tree[-1]
+        for side in (1, -1)
+    ]
+    assert_close(result.q_tree[-1][:, 0], (ends[0] - ends[1]) / (2 * step), 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"prescribed": [{"joint": "theta_9"}]}, "theta_9"),
+        ({"prescribed": [{"joint": "theta_1"}, {"joint": "theta_1"}]}, "prescribed twice"),
+        ({"spf_coordinates": "z", "formulation": "spf"}, 'spf_coordinates = "w"'),
+    ],
+)
+def test_unusable_prescribed_joints_are_rejected(overrides: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        simulate("five_bar/swing", {**scene("reduced"), **overrides})
+
+
+def test_paper_controllers_are_refused_with_prescribed_joints() -> None:
+    with pytest.raises(InputError, match="eqs. 14 and 16"):
+        simulate(
+            "five_bar/set_point",
+            {"prescribed": [{"joint": "theta_1", "offset": -1.4}], "controller.K_P": 1.0, "controller.K_V": 1.0},
+        )
+
+
+def test_harmonics_of_the_test_are_those_of_the_scene() -> None:
+    ours = Harmonics([HarmonicsSpec(offset=-1.4, harmonics=[(0.3, 5.0, 0.4), (0.05, 13.0, -0.3)])])(0.7)
+    assert_close(np.ravel(ours), np.array(left_crank(0.7)), 1e-12)
