@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from os.path import exists
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.build import make_controller
 from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
-from ckc_pin.control.desired import Harmonics
+from ckc_pin.control.desired import Desired, find_rate_jump, make_motion
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.errors import InputError
@@ -49,9 +50,22 @@ def rebuild_scene_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
     return load(name, overrides, prescribed_positions(scene.spec.prescribed))
 
 
-def prescribed_motion(prescribed: Sequence[PrescribedSpec]) -> Harmonics:
-    """Return the motion of prescribed joints over time, in their order."""
-    return Harmonics(prescribed)
+def prescribed_motion(prescribed: Sequence[PrescribedSpec]) -> Desired:
+    """Return the motion of prescribed joints over time, in their order.
+
+    Raises
+    ------
+    InputError
+        Keys that do not go together, or a rate that jumps, which no finite torque can follow.
+    """
+    motion = make_motion(prescribed, [f"prescribed, joint {one.joint!r}" for one in prescribed])
+    jump = find_rate_jump(motion, math.inf)
+    if jump is not None:
+        raise InputError(
+            f"prescribed: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
+            'use profile = "quintic", "cubic" or "trapezoidal"'
+        )
+    return motion
 
 
 def prescribed_positions(prescribed: Sequence[PrescribedSpec]) -> dict[str, float]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from ckc_pin.base.toml import FileStruct
-from ckc_pin.control.spec import ControllerSpec, HarmonicsSpec
+from ckc_pin.control.spec import ControllerSpec, MotionSpec
 from ckc_pin.mechanism.library import GeneratorSpec
 from ckc_pin.mechanism.spec import Name, Vector3
 
@@ -132,7 +132,7 @@ class EventSpec(FileStruct, frozen=True):
     stop: bool = False
 
 
-class PrescribedSpec(HarmonicsSpec, frozen=True, kw_only=True):
+class PrescribedSpec(MotionSpec, frozen=True, kw_only=True):
     """A joint whose motion is imposed exactly, as a constraint row in time. `tau` is the torque that this takes.
 
     Attributes
@@ -141,11 +141,26 @@ class PrescribedSpec(HarmonicsSpec, frozen=True, kw_only=True):
         The joint. It is no longer an independent coordinate.
         ``joint = "crank"``
     offset : rad, m
-        Mean value.
+        Constant part of the value.
         ``offset = -1.4``
+    rate : rad/s, m/s
+        Constant part of the rate, for ever.
+        ``rate = 6.2832``
     harmonics : rad or m, rad/s, rad
         Any number of waves, ``[amplitude, frequency, phase]`` each.
         ``harmonics = [[1.0472, 1.0, 0.0]]``
+    waypoints : s, rad or m
+        ``[t, value]`` each, at least two; the value is held before the first and after the last.
+        ``waypoints = [[0.0, 0.0], [1.0, 0.8], [2.0, 0.5]]``
+    profile
+        Of the motion between waypoints; ``"quintic"`` if absent.
+        ``profile = "trapezoidal"``
+    max_rate : rad/s, m/s
+        Limit of the rate, of ``profile = "trapezoidal"`` only.
+        ``max_rate = 2.0``
+    max_acceleration : rad/s², m/s²
+        Acceleration at the beginning and at the end of each piece, of ``profile = "trapezoidal"`` only.
+        ``max_acceleration = 8.0``
     """
 
     joint: Name
@@ -195,7 +210,7 @@ class SceneSpec(FileStruct, frozen=True):
         ``event = [{of = "limit", stop = true}]``
     prescribed
         Joints that move as prescribed, whatever torque that takes.
-        ``prescribed = [{joint = "crank", offset = 0.4, harmonics = [[0.5, 2.0, 0.0]]}]``
+        ``prescribed = [{joint = "crank", rate = 6.2832}]``
     """
 
     mechanism: str | GeneratorSpec
