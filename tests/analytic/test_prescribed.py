@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson, solve_ivp
 
-from ckc_pin import InputError, NumericalError, Run, Simulator, sensitivities, simulate
+from ckc_pin import InputError, Run, Simulator, sensitivities, simulate
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -143,10 +144,10 @@ def test_motion_that_the_loops_cannot_follow_stops(formulation: str) -> None:
     """The slider is pushed past the stretched linkage, 0.4 m from the crank's pivot."""
     slider = {"joint": "slider", "offset": 0.3, "rate": 0.1}
     overrides = {"formulation": formulation, "prescribed": [slider], "t_end": 2.0, "initial": {"at": "assembled"}}
-    with pytest.raises(NumericalError, match=r"singular|loses rank|cannot be kept closed") as error:
-        run = simulate("slider_crank", overrides)
-        raise NumericalError(run.message, t=float(run.t[-1]))
-    assert error.value.t == pytest.approx(1.0, abs=0.02)
+    run = simulate("slider_crank", overrides)
+    assert run.status == "stopped"
+    assert re.search("singular|loses rank|cannot be kept closed", run.message)
+    assert run.t[-1] == pytest.approx(1.0, abs=0.02)
 
 
 def test_saved_run_keeps_the_prescribed_joint(tmp_path: Path) -> None:
@@ -183,7 +184,7 @@ def test_unusable_prescribed_joints_are_rejected(overrides: dict[str, Any], mess
 
 
 def test_paper_controllers_are_refused_with_prescribed_joints() -> None:
-    with pytest.raises(InputError, match="eqs. 14 and 16"):
+    with pytest.raises(InputError, match=r"eqs\. 14 and 16"):
         simulate(
             "five_bar/set_point",
             {"prescribed": [{"joint": "theta_1", "offset": -1.4}], "controller.K_P": 1.0, "controller.K_V": 1.0},
