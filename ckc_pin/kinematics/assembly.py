@@ -12,13 +12,14 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.kinematics.continuation import MAX_NEWTON_STEP
+from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import count_freedoms
-from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["Assembly", "assemble_mechanism", "close_loops"]
@@ -157,20 +158,89 @@ def assemble_mechanism(
         Unknown names, loops that cannot be closed from q_guess, or unsuitable independent coordinates.
     """
     linkage = Linkage(spec, sources, overrides, prescribed)
-    tree, closure, size = linkage.tree, linkage.closure, linkage.size
+    tree = linkage.tree
     with one_blas_thread():
         guess = tree.vector({**spec.q_guess, **(prescribed or {})}, tree.coordinates, "q_guess", fill=0.0)
-        closed = _assemble(linkage, tree.from_coordinates(guess))
-        lengths = bool(np.all(closure.in_metres(tree)))
-        rounding = 1e-13 * (size if lengths else max(size, 1.0))
-        tolerance = rounding if closed.residual <= EXACT_TOLERANCE * size else 10 * closed.residual
-        accept = max(tolerance, rounding)
+        guess = _apply_couplings(linkage, guess)
+        mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess)))
+        return mechanism if linkage.spec.independent is not None else _restore_guess(linkage, mechanism)
 
-        def nearby(tangent: Array) -> list[Array]:
-            return _nearby(tree, closure, closed.q_tree, tangent, accept)
 
-        freedoms = count_freedoms(tree, closure, closed.q_tree, nearby)
-        return Mechanism(linkage, closed.q_tree, closed.residual, tolerance, freedoms)
+def _create_mechanism(linkage: Linkage, closed: Assembly, independent: tuple[str, ...] | None = None) -> Mechanism:
+    """Create the mechanism at a closed configuration, with the tolerance to which its loops close."""
+    tree, closure, size = linkage.tree, linkage.closure, linkage.size
+    lengths = bool(np.all(closure.in_metres(tree)))
+    rounding = 1e-13 * (size if lengths else max(size, 1.0))
+    tolerance = rounding if closed.residual <= EXACT_TOLERANCE * size else 10 * closed.residual
+    accept = max(tolerance, rounding)
+
+    def nearby(tangent: Array) -> list[Array]:
+        return _nearby(tree, closure, closed.q_tree, tangent, accept)
+
+    freedoms = count_freedoms(tree, closure, closed.q_tree, nearby)
+    return Mechanism(linkage, closed.q_tree, closed.residual, tolerance, freedoms, independent)
+
+
+def _apply_couplings(linkage: Linkage, guess: Array) -> Array:
+    """Return a guess that satisfies the couplings: the follower of each one gets the value that its master implies.
+
+    The master follows instead if only the follower has an entry in q_guess, and neither if both have one.
+    """
+    tree, guess = linkage.tree, guess.copy()
+    known, pending = set(linkage.spec.q_guess), list(linkage.couplings)
+    while pending:
+        coupling = _next_coupling(pending, known)
+        pending.remove(coupling)
+        joint, other = tree.index[coupling.joint], tree.index[coupling.other]
+        if coupling.joint not in known:
+            guess[joint] = coupling.ratio * guess[other] + coupling.offset
+        elif coupling.other not in known and coupling.ratio != 0.0:
+            guess[other] = (guess[joint] - coupling.offset) / coupling.ratio
+        known |= {coupling.joint, coupling.other}
+    return guess
+
+
+def _next_coupling(pending: list[CouplingSpec], known: set[str]) -> CouplingSpec:
+    """Return a coupling of a joint whose value is known, else one whose master follows no other joint."""
+    for coupling in pending:
+        if coupling.joint in known or coupling.other in known:
+            return coupling
+    followers = {coupling.joint for coupling in pending}
+    return next((coupling for coupling in pending if coupling.other not in followers), pending[0])
+
+
+def _restore_guess(linkage: Linkage, mechanism: Mechanism) -> Mechanism:
+    """Move an assembled mechanism so that the independent coordinates which it chose have their values of q_guess.
+
+    The closed configuration nearest to the guess differs from it in all coordinates. The mechanism stays as it is if
+    the loops cannot be closed with these values on its branch, or only beyond stops.
+    """
+    tree, guess = linkage.tree, linkage.spec.q_guess
+    numbers, at_q = tree.to_coordinates(mechanism.q_tree), mechanism.partition.q
+    q = np.array([guess.get(name, numbers[tree.index[name]]) for name in mechanism.independent])
+    if np.array_equal(q, numbers[at_q]) or mechanism.splits_root or mechanism.freedoms.singular:
+        return mechanism
+    moved = sigma(mechanism, q, anywhere=False)
+    if moved.verdict != "converged":
+        return mechanism
+    end = tree.to_coordinates(moved.at.q_tree)
+    end[at_q] = q  # The steps to q add up to it except for rounding.
+    closed = newton(mechanism.kinematics(tree.from_coordinates(end)), 0.0, mechanism.tolerance)
+    accepted = np.maximum(_excess(linkage, numbers), EXACT_TOLERANCE * tree.step_scale)
+    is_beyond_stop = np.any(_excess(linkage, tree.to_coordinates(closed.at.q_tree)) > accepted)
+    if not closed.converged or is_beyond_stop or linkage.closure.reversed_hinges(closed.at.pose):
+        return mechanism
+    phi = closed.at.phi
+    assembly = Assembly(closed.at.q_tree, float(np.abs(phi).max(initial=0.0)), linkage.closure.largest_residuals(phi))
+    try:
+        return _create_mechanism(linkage, assembly, mechanism.independent)
+    except MechanismError:  # phi_z is singular at the guess
+        return mechanism
+
+
+def _excess(linkage: Linkage, numbers: Array) -> Array:
+    """Return how far each coordinate is beyond its stops, 0 within them, shape (n,)."""
+    return np.abs(numbers - np.clip(numbers, linkage.joints.lower, linkage.joints.upper))
 
 
 def _nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
@@ -225,7 +295,7 @@ def _move_within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
     """Move a configuration beyond stops, where no run can start, to a nearby one within them if there is one."""
     tree, joints = linkage.tree, linkage.joints
     numbers = tree.to_coordinates(closed.q_tree)
-    beyond = np.abs(numbers - np.clip(numbers, joints.lower, joints.upper)) > EXACT_TOLERANCE * tree.step_scale
+    beyond = _excess(linkage, numbers) > EXACT_TOLERANCE * tree.step_scale
     if not np.any(beyond):
         return closed
     within = _close_near(linkage, closed.q_tree, (joints.lower, joints.upper))

@@ -53,6 +53,8 @@ class Linkage:
         Names of the prescribed joints.
     motors : Motors or None
         None if the file names no motors.
+    couplings : tuple of CouplingSpec
+        Of the mechanism file, then those of the URDFs' mimic joints.
     points : dict of str to Frame
     size : float
         Characteristic length, metres.
@@ -82,7 +84,8 @@ class Linkage:
         for loop in spec.loop:
             builder.add_loop(loop)
         mimic = [CouplingSpec(joint=a, other=b, ratio=r, offset=c) for a, b, r, c in urdf.mimic]
-        for coupling in [*spec.coupling, *mimic]:
+        self.couplings = (*spec.coupling, *mimic)
+        for coupling in self.couplings:
             builder.add_coupling(coupling)
         self.closed: Closure = builder.build()
         for joint, value in (prescribed or {}).items():

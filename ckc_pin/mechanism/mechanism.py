@@ -38,6 +38,8 @@ class Mechanism(HasSummary):
         Largest |phi| in this configuration, and largest |phi| that counts as closed.
     freedoms : Freedoms
         Degrees of freedom, from the rank of J.
+    independent : tuple of str, optional
+        The independent coordinates, if neither the mechanism file names them nor a pivoted QR shall choose them.
 
     Raises
     ------
@@ -70,7 +72,15 @@ class Mechanism(HasSummary):
     warnings : list of str
     """
 
-    def __init__(self, linkage: Linkage, q_tree: Array, residual: float, tolerance: float, freedoms: Freedoms) -> None:
+    def __init__(
+        self,
+        linkage: Linkage,
+        q_tree: Array,
+        residual: float,
+        tolerance: float,
+        freedoms: Freedoms,
+        independent: Sequence[str] | None = None,
+    ) -> None:
         self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
         self.urdf = linkage.urdf.root
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
@@ -84,7 +94,7 @@ class Mechanism(HasSummary):
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
         self._drop_ineffective_friction()
-        self._choose_independent(linkage.motors)
+        self._choose_independent(linkage.motors, self.spec.independent if independent is None else independent)
         self._choose_motors(linkage.motors)
 
     def summary(self) -> Summary:
@@ -192,8 +202,8 @@ class Mechanism(HasSummary):
         names = ", ".join(self.coordinates[k] for k in np.flatnonzero(idle))
         self.warnings.append(f"friction and stops do nothing in joints that the loops do not let move: {names}")
 
-    def _choose_independent(self, motors: Motors | None) -> None:
-        """Choose q and z, or check the choice of the mechanism file."""
+    def _choose_independent(self, motors: Motors | None, preset: Sequence[str] | None) -> None:
+        """Choose q and z, or check a preset choice."""
         coordinates = set(range(self.n))
         chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
         best = [self.coordinates[k] for k in sorted(coordinates - (chosen or set()))]
@@ -201,8 +211,8 @@ class Mechanism(HasSummary):
         if chosen is None:  # every choice splits the six coordinates of a free root
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
             best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
-        if self.spec.independent is not None:
-            names = [name for name in self.spec.independent if name not in self.prescribed]
+        if preset is not None:
+            names = [name for name in preset if name not in self.prescribed]
         else:
             names = self._prefer_driven(best, motors)
         at = self.tree.indices(tuple(names), "independent")

@@ -334,8 +334,10 @@ class MechanismSpec(FileStruct, frozen=True):
         Default: the independent joints.
         ``actuated = ["theta_1", "theta_3"]``
     q_guess : rad, m
-        Initial guess of the assembly, which selects the assembly branch. Default: 0 for each coordinate. If it leads
-        beyond stops, the mechanism is assembled at the nearest configuration within them.
+        Initial guess of the assembly, which selects the assembly branch. Default: 0 for each coordinate, and for the
+        follower of a coupling the value that its master implies. Independent coordinates keep their value if the loops
+        can be closed with it. If the guess leads beyond stops, the mechanism is assembled at the nearest configuration
+        within them.
         ``q_guess = {theta_1 = -1.4, "root.z" = 0.5}``
     loop
         Loop closures.
