@@ -134,6 +134,7 @@ def _choose_columns(matrix: Array, count: int, labels: IntArray, avoided: Sequen
     return labels[np.concatenate([first, others[pivoted_columns(remainder)[0][: count - len(first)]]])]
 
 
+IDLE_TOLERANCE = 1e-6  # of the largest motion; a centre of mass rounded to six digits counts as on its axis
 IMMOBILE_TOLERANCE = 1e-9  # largest part of a coordinate that cannot move in motions of size one
 
 
@@ -221,7 +222,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
 
 
 def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequence[Anchors], shafts: Array) -> list[str]:
-    """Name coordinates that only spin a body about itself.
+    """Name coordinates that only spin a body about itself, one for each such freedom.
 
     Such a motion moves no centre of mass, no point of a loop or spring, and no shaft.
 
@@ -241,12 +242,10 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequenc
     if 0 in moves.shape:
         return []
     _, values, directions = np.linalg.svd(moves, full_matrices=True)
-    idle_motions = directions[int(np.sum(values > 1e-8 * max(values[0], 1e-300))) :]
-    names: list[str] = []
-    for direction in idle_motions:
-        motion = np.abs(tangent @ direction)
-        names.append(tree.coordinates[int(np.argmax(motion))])
-    return list(dict.fromkeys(names))
+    idle_motions = directions[int(np.sum(values > IDLE_TOLERANCE * max(values[0], 1e-300))) :] @ tangent.T
+    # Singular vectors of equal values mix the spins of several bodies; the pivots of a QR belong to one body each.
+    order, _ = pivoted_columns(idle_motions)
+    return [tree.coordinates[k] for k in sorted(int(k) for k in order[: len(idle_motions)])]
 
 
 def _right_singular_vectors(jacobian: Array) -> Array:

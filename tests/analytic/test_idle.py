@@ -54,3 +54,50 @@ def test_freedoms_of_bodies_on_springs_are_not_idle(tmp_path: Path) -> None:
         'frame_a = { link = "body", xyz = [0.1, 0.0, 0.0] }\nframe_b = { link = "world", xyz = [0.2, 0.3, -0.8] }\n'
     )
     assert not any("idle" in warning for warning in load(write_hanging_body(tmp_path, extra)).warnings)
+
+
+def rods(folder: Path, count: int) -> str:
+    """Write slider-cranks whose coupler is a rod between two ball joints; its mass centre is on its axis to 2e-9 m."""
+    text, loops = '<robot name="rods"><link name="base"/>', ""
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+
+        def link(name: str, xyz: str, k: int = k) -> str:
+            return (
+                f'<link name="{name}_{k}"><inertial><origin xyz="{xyz}"/><mass value="0.1"/>'
+                '<inertia ixx="1e-5" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            )
+
+        def joint(name: str, kind: str, parent: str, axis: str, xyz: str, k: int = k, angle: float = angle) -> str:
+            rpy = f"{0.1 * k} {0.2 * k} {angle}" if parent == "base" else "0 0 0"
+            child = {"ball_z": "rod"}.get(name, name)
+            base = parent if parent == "base" else f"{parent}_{k}"
+            limit = '<limit lower="-9" upper="9" effort="1" velocity="1"/>' if kind == "prismatic" else ""
+            return (
+                f'<joint name="{name}_{k}" type="{kind}"><parent link="{base}"/><child link="{child}_{k}"/>'
+                f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>{limit}</joint>'
+            )
+
+        text += link("crank", "0 0 0.02") + link("rod", "0.0425 8e-11 -1.9e-9") + link("slide", "0 0 0")
+        text += f'<link name="ball_x_{k}"/><link name="ball_y_{k}"/>'
+        text += joint("crank", "continuous", "base", "0 1 0", "0 0 0")
+        text += joint("ball_x", "continuous", "crank", "1 0 0", "0 0 0.05")
+        text += joint("ball_y", "continuous", "ball_x", "0 1 0", "0 0 0")
+        text += joint("ball_z", "continuous", "ball_y", "0 0 1", "0 0 0")
+        text += joint("slide", "prismatic", "base", "1 0 0", "0 0 0")
+        loops += (
+            f'[[loop]]\nname = "pin_{k}"\ntype = "point"\nframe_a = {{link = "rod_{k}", xyz = [0.085, 0, 0]}}\n'
+            f'frame_b = {{link = "slide_{k}", xyz = [0.085, 0, 0.05]}}\n'
+        )
+    (folder / "rods.urdf").write_text(text + "</robot>")
+    motors = f"actuated = {[f'crank_{k}' for k in range(count)]}"
+    (folder / "mechanism.toml").write_text(f'name = "rods"\nurdf = "rods.urdf"\n{motors}\n{loops}')
+    return str(folder / "mechanism.toml")
+
+
+def test_each_rod_that_spins_freely_is_named(tmp_path: Path) -> None:
+    """Six equal rods: their spins are one subspace, of which a singular vector mixes several rods."""
+    (idle,) = [warning for warning in load(rods(tmp_path, 6)).warnings if "idle freedoms" in warning]
+    names = idle.rpartition(": ")[2].split(", ")
+    assert sorted(name.rpartition("_")[2] for name in names) == [str(k) for k in range(6)]
+    assert all(name.startswith("ball_") for name in names)
