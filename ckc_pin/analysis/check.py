@@ -58,6 +58,8 @@ class Check(HasSummary):
         None unless phi_z is square.
     sigma_min_phi_z, cond_phi_z : float
         Smallest singular value and condition number of phi_z.
+    size : float
+        Largest distance between neighbouring joints, or from a joint to a loop's frame, m.
     gap : (above, below)
         Relative singular values of the scaled J on both sides of the rank decision.
     mass : float
@@ -91,6 +93,7 @@ class Check(HasSummary):
     det_phi_z: float | None
     sigma_min_phi_z: float
     cond_phi_z: float
+    size: float
     gap: tuple[float, float]
     mass: float
     inertia: Array
@@ -118,6 +121,7 @@ class Check(HasSummary):
             rows.append(("det phi_z", f"{self.det_phi_z:.6g}"))
         rows += [
             ("sigma_min(phi_z), cond", f"{self.sigma_min_phi_z:.6g}, {self.cond_phi_z:.4g}"),
+            ("size", f"{self.size:.4g} m, the largest distance between joints"),
             ("moving mass", f"{self.mass:.6g} kg"),
             ("its inertia, kg m²", inertia),
             ("", "as assembled, about its centre of mass, world's axes"),
@@ -217,6 +221,7 @@ def _check_mechanism(mechanism: Mechanism, warnings: list[str]) -> Check:
         det_phi_z=float(np.linalg.det(at.phi_z)) if is_square else None,
         sigma_min_phi_z=smallest,
         cond_phi_z=largest / smallest if smallest > 0 else float("inf"),
+        size=mechanism.size,
         gap=(mechanism.freedoms.rank.above, mechanism.freedoms.rank.below),
         mass=mass,
         inertia=inertia,

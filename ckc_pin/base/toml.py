@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
+from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, suggest_name
 from ckc_pin.errors import InputError
 
 __all__ = [
@@ -39,7 +40,6 @@ MAX_BYTES = 16 * 2**20  # of a text file; no mechanism, scene or URDF that a per
 MAX_DEPTH = 50  # nested tables and lists; tomllib accepts any depth of dotted keys, the code that follows recurses
 MAX_FAULTS = 5  # reported for one file
 MAX_QUOTED = 60  # characters of a value in a message
-MIN_SIMILARITY = 0.7  # of an unknown key and a valid one, from 0 to 1, for "did you mean"
 INTEGERS = range(-(2**63), 2**63)  # the range of TOML
 TOO_LARGE = "an integer of at most 64 bits, or a number such as 1e20"
 CONVERTIBLE = {"an integer": ["a number"]}  # by the type of a value: other types that it may stand for
@@ -210,8 +210,8 @@ class Fault(msgspec.Struct, frozen=True):
         Type or length of the value, if that is wrong.
     choices : tuple
         The valid keys or values, if there are few.
-    suggestion : str or None
-        The choice that the user probably meant.
+    suggestion : str
+        Ends the message with the choice that the user probably meant.
     """
 
     path: tuple[Step, ...]
@@ -220,7 +220,7 @@ class Fault(msgspec.Struct, frozen=True):
     expected: str = ""
     got: str = ""
     choices: tuple[Any, ...] = ()
-    suggestion: str | None = None
+    suggestion: str = ""
 
     def sentence(self, at: str = "") -> str:
         """Return the message; `at` is the place of the data in their file."""
@@ -234,7 +234,7 @@ class Fault(msgspec.Struct, frozen=True):
         expected = f": expected {self.expected}" if self.expected else ""
         expected += f", got {self.got}" if self.got else ""
         valid = f"; valid: {', '.join(choices)}" if self.choices else ""
-        return f"{head}{expected}{valid}{f'; did you mean {self.suggestion!r}?' if self.suggestion else ''}"
+        return f"{head}{expected}{valid}{self.suggestion}"
 
 
 def find_faults(data: Any, kind: Any, path: tuple[Step, ...] = ()) -> Iterator[Fault]:
@@ -289,24 +289,33 @@ def _faults_of_table(data: Mapping[Any, Any], structs: Sequence[Any], path: tupl
             yield Fault(path, "missing key", tag_key, choices=tuple(tags))
             return
         if not isinstance(data[tag_key], str) or data[tag_key] not in tags:
-            yield Fault((*path, tag_key), "value", data[tag_key], choices=tuple(tags))
+            suggestion = suggest_name(data[tag_key], tags)
+            yield Fault((*path, tag_key), "value", data[tag_key], choices=tuple(tags), suggestion=suggestion)
             return
         structs = [tags[data[tag_key]]]
     fields = {field.encode_name: field for field in msgspec.structs.fields(structs[0])}
     keys = (*([tag_key] if tag_key else []), *fields)
-    suggestions = set()
+    misspelled: set[str | None] = set()
     for key in data:
         if key not in keys and structs[0].__struct_config__.forbid_unknown_fields:
-            from difflib import get_close_matches  # imported here because a file without errors does not need it
-
-            suggestion = next(iter(get_close_matches(str(key), set(keys) - set(data), 1, MIN_SIMILARITY)), None)
-            suggestions.add(suggestion)
+            name = str(key)
+            nearest = find_nearest_name(name, [k for k in keys if k not in data], MIN_SIMILARITY)
+            misspelled.add(nearest)
+            of_table = next((f"{k}.{name}" for k, field in fields.items() if name in _keys_of_tables(field.type)), None)
+            probable = nearest or of_table
+            suggestion = suggest_name(name, keys if probable is None else [probable])
             yield Fault(path, "unknown key", key, choices=keys, suggestion=suggestion)
     for key, field in fields.items():
         if key in data:
             yield from find_faults(data[key], field.type, (*path, key))
-        elif field.required and key not in suggestions:
+        elif field.required and key not in misspelled:
             yield Fault(path, "missing key", key, choices=_choices(field.type))
+
+
+def _keys_of_tables(kind: Any) -> set[str]:
+    """Return the keys of the tables that a key's value may be."""
+    structs = [member for member in _members(kind) if _is_struct(member)]
+    return {field.encode_name for struct in structs for field in msgspec.structs.fields(struct)}
 
 
 def _faults_of_list(data: Sequence[Any], items: Sequence[Any], path: tuple[Step, ...]) -> Iterator[Fault]:
@@ -334,7 +343,9 @@ def _fault_of_value(value: Any, kind: Any, length: int | None, path: tuple[Step,
     if not same_type:
         return Fault(path, "value", value, _join_or([_type_name(member) for member in _members(kind)]), value_type)
     choices = _choices(kind)
-    return Fault(path, "value", value, "" if choices else _join_or(map(_bounded_type_name, same_type)), choices=choices)
+    if choices:
+        return Fault(path, "value", value, choices=choices, suggestion=suggest_name(value, choices))
+    return Fault(path, "value", value, _join_or(map(_bounded_type_name, same_type)))
 
 
 # --- types ---------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ Every function raises InputError with one sentence: ``function: argument: expect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from inspect import signature
 from os import PathLike, fsencode, fspath
 from typing import Any
@@ -15,8 +15,10 @@ import numpy as np
 from ckc_pin.errors import InputError
 
 __all__ = [
+    "MIN_SIMILARITY",
     "accepts_arguments",
     "describe_value",
+    "find_nearest_name",
     "is_number",
     "require_callable",
     "require_controller_signature",
@@ -24,10 +26,12 @@ __all__ = [
     "require_path",
     "require_table",
     "require_type",
+    "suggest_name",
 ]
 
 SHORT_TYPES = (int, float, complex, str, bytes, type(None), np.generic)  # quoted in messages; others by their type
 MAX_QUOTED = 80  # characters of a value in a message
+MIN_SIMILARITY = 0.7  # of an unknown name and a valid one, from 0 to 1, for "did you mean"
 
 
 def describe_value(value: Any) -> str:
@@ -126,3 +130,38 @@ def require_flag(value: Any, where: str) -> None:
 def is_number(value: Any) -> bool:
     """Whether a value is a real number of Python or NumPy; True and False are not numbers."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def find_nearest_name(name: str, names: Iterable[str], min_similarity: float = 0.0) -> str | None:
+    """Return the valid name that is most similar to an unknown one, regardless of case and underscores.
+
+    Parameters
+    ----------
+    name : str
+    names : iterable of str
+        The valid names.
+    min_similarity : float
+        Between 0 and 1. The result is None if no name is so similar.
+    """
+    from difflib import SequenceMatcher  # imported here because input without errors does not need it
+
+    def similarity(other: str) -> float:
+        return max(
+            SequenceMatcher(None, name, other).ratio(), SequenceMatcher(None, _plain(name), _plain(other)).ratio()
+        )
+
+    best = max(names, key=similarity, default=None)
+    return best if best is not None and similarity(best) >= min_similarity else None
+
+
+def suggest_name(name: Any, names: Iterable[Any]) -> str:
+    """Return the end of a message about an unknown name: the most similar valid name; empty if there is none."""
+    nearest = find_nearest_name(str(name), [other for other in names if isinstance(other, str)])
+    if nearest is None or not isinstance(name, str):
+        return ""
+    is_similar = find_nearest_name(name, [nearest], MIN_SIMILARITY) or nearest.endswith(f".{name}")
+    return f"; did you mean {nearest!r}?" if is_similar else f"; the nearest is {nearest!r}"
+
+
+def _plain(name: str) -> str:
+    return name.casefold().replace("_", "").replace("-", "")

@@ -37,7 +37,7 @@ MAX_GAIN = 1e100  # products of gains and their squares do not overflow
 SYMMETRY_TOLERANCE = 1e-12  # relative to the largest entry
 EIGENVALUE_TOLERANCE = 1e-14  # relative to the largest entry: [[1, 1], [1, 1]] is semi-definite up to rounding
 
-Gain = float | dict[str, float] | list[list[float]]
+Gain = float | dict[str, float] | list[float | list[float]]
 Limit = Annotated[float, msgspec.Meta(gt=0)]
 Size = Annotated[float, msgspec.Meta(ge=0)]
 
@@ -164,7 +164,7 @@ class SetPointSpec(_FeedbackSpec, frozen=True, tag="set_point"):
     Attributes
     ----------
     K_P : N m/rad, N/m
-        Positive definite: a number, a table by joint, or a matrix in ``independent`` order.
+        Positive definite: a number, a table by joint, or in ``independent`` order a list of the diagonal or a matrix.
         ``K_P = 10.0``
     K_V : N m s/rad, N s/m
         Positive semi-definite; the same forms.
@@ -322,8 +322,8 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
 
     Parameters
     ----------
-    gain : number, {joint: number} or (d, d) array
-        A number or a table makes a diagonal matrix.
+    gain : number, {joint: number}, (d,) array or (d, d) array
+        A number, a table or a list of d numbers makes a diagonal matrix.
     names : sequence of str
         Independent coordinates.
     what : str
@@ -345,10 +345,7 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
     elif is_number(gain):
         matrix = float(cast(float, gain)) * np.eye(d)
     else:
-        shape = f"controller.{what}: a matrix must be {d} x {d}, rows in the order {', '.join(names)}"
-        matrix = _read_matrix(gain, what, shape)
-        if matrix.shape != (d, d):
-            raise InputError(shape)
+        matrix = _read_matrix(gain, names, what)
     if not np.all(np.isfinite(matrix)):
         raise InputError(f"controller.{what}: an entry is not a finite number")
     if np.abs(matrix).max(initial=0.0) > MAX_GAIN:
@@ -356,14 +353,24 @@ def gain_matrix(gain: Gain | Array, names: Sequence[str], what: str) -> Array:
     return matrix
 
 
-def _read_matrix(gain: Any, what: str, shape_message: str) -> Array:
+def _read_matrix(gain: Any, names: Sequence[str], what: str) -> Array:
+    """Return the matrix of a list of d numbers, its diagonal, or of d rows of d numbers."""
+    d = len(names)
+    forms = f"a number, a table by joint, a list of {d} numbers (the diagonal) or a {d} x {d} matrix"
+    expected = f"controller.{what}: expected {forms} in the order {', '.join(names)}"
     if not isinstance(gain, list | tuple | np.ndarray):
-        forms = "a number, a table by joint or a matrix"
-        raise InputError(f"controller.{what}: expected {forms}, got {describe_value(gain)}")
+        raise InputError(f"{expected}, got {describe_value(gain)}")
     try:
-        return np.array(gain, dtype=float)
+        matrix = np.array(gain, dtype=float)
     except (TypeError, ValueError):  # rows of different lengths, or words among the numbers
-        raise InputError(shape_message) from None
+        raise InputError(f"{expected}, got rows of different lengths or entries that are not numbers") from None
+    if matrix.shape == (d,):
+        return np.diag(matrix)
+    if matrix.shape != (d, d):
+        shape = " x ".join(map(str, matrix.shape))
+        got = f"a list of {len(matrix)} numbers" if matrix.ndim == 1 else f"a {shape} matrix"
+        raise InputError(f"{expected}, got {got}")
+    return matrix
 
 
 def require_positive_definite(matrix: Array, what: str, *, semi: bool = False) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from ckc_pin.base.toml import convert
+from ckc_pin.base.validation import suggest_name
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.spec import MechanismSpec
 from ckc_pin.mechanism.urdf import INERTIA, LIMITS, check_inertial, check_range, floats
@@ -158,7 +159,9 @@ def require_known(names: Iterable[str], values: Mapping[str, Value], where: str,
             continue
         root = name.partition(".")[0]
         if root not in roots:
-            raise InputError(f"{where}: {name!r} names nothing; names begin with {', '.join(roots)}")
+            raise InputError(
+                f"{where}: {name!r} names nothing; names begin with {', '.join(roots)}{suggest_name(root, roots)}"
+            )
         carriers = dict.fromkeys(_carrier(other) for other in values if other.partition(".")[0] == root)
         matches = [c for c in carriers if name == c or name.startswith(f"{c}.")]
         if matches:
@@ -168,7 +171,7 @@ def require_known(names: Iterable[str], values: Mapping[str, Value], where: str,
             choices = list(carriers)
         whose = "mechanism" if root in ROOTS else "scene"
         there = f"there are {', '.join(choices)}" if choices else f"nothing of this {whose} is a {root}"
-        raise InputError(f"{where}: no {name!r}; {there}")
+        raise InputError(f"{where}: no {name!r}; {there}{suggest_name(name, choices)}")
 
 
 def _merge_components(present: Mapping[str, Value], overrides: Overrides, source: str) -> dict[str, Value]:

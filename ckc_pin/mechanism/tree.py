@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.validation import is_number
+from ckc_pin.base.validation import is_number, suggest_name
 from ckc_pin.errors import InputError, MechanismError
 
 __all__ = ["Tree"]
@@ -271,7 +271,8 @@ class Tree:
         """Return the places of coordinates in `coordinates` (InputError lists the valid names)."""
         for name in names:
             if name not in self.index:
-                raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}")
+                nearest = suggest_name(name, self.coordinates)
+                raise InputError(f"{what}: no coordinate {name!r}; there are {', '.join(self.coordinates)}{nearest}")
         return np.array([self.index[name] for name in names], dtype=np.intp)
 
     def vector(self, values: Mapping[str, float], names: Sequence[str], what: str, fill: float | None = None) -> Array:
@@ -284,7 +285,8 @@ class Tree:
         """
         unknown = next((name for name in values if name not in names), None)
         if unknown is not None:
-            raise InputError(f"{what}: no coordinate {unknown!r} here; there are {', '.join(names)}")
+            nearest = suggest_name(unknown, names)
+            raise InputError(f"{what}: no coordinate {unknown!r} here; there are {', '.join(names)}{nearest}")
         missing = [name for name in names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(names)}")

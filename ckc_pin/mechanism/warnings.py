@@ -6,6 +6,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.unit_hints import find_unit_warnings
 
 __all__ = [
     "compute_moving_mass",
@@ -22,8 +23,8 @@ MIN_LENGTH = 1e-12  # mechanism sizes: a link between joints closer than this ha
 
 
 def find_model_warnings(mechanism: Mechanism) -> list[str]:
-    """Warn of links without mass, springs without effect, and coordinates assembled far from their guess."""
-    warnings = []
+    """Warn of units, links without mass, springs without effect, and coordinates assembled far from their guess."""
+    warnings = find_unit_warnings(mechanism)
     if massless := _massless_links(mechanism):
         warnings.append(f"links that move without mass (no <inertial>, or its mass is 0): {', '.join(massless)}")
     for k, spring in enumerate(mechanism.spec.spring):

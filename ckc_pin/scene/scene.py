@@ -17,7 +17,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
-from ckc_pin.base.validation import require_table, require_type
+from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_table, require_type, suggest_name
 from ckc_pin.control.spec import ControllerSpec, FeedbackSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import (
@@ -30,7 +30,7 @@ from ckc_pin.mechanism.library import (
     shipped,
 )
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import is_parameter
+from ckc_pin.mechanism.parameters import ROOTS, is_parameter
 from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
 
 __all__ = [
@@ -341,6 +341,7 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[
     for path in TABLES_BY_NAME:
         join_dotted_keys(result, *path)
     for key, value in overrides.items():
+        _check_root(key)
         *tables, last = _split_key(f"parameters.{key}" if is_parameter(key) else key)
         target = result
         for k, table in enumerate(tables):
@@ -352,6 +353,19 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[
         else:
             target[last] = to_toml_value(value)
     return result
+
+
+def _check_root(key: str) -> None:
+    """Raise InputError if a key begins almost like the name of a mechanism parameter, and not like a scene's key."""
+    root, keys = key.partition(".")[0], SceneSpec.__struct_fields__
+    if root in keys or is_parameter(key):
+        return
+    nearest = find_nearest_name(root, [*keys, *ROOTS], MIN_SIMILARITY)
+    if nearest in ROOTS:
+        raise InputError(
+            f"{key}: neither a key of a scene nor a parameter of a mechanism, which begins with {', '.join(ROOTS)}"
+            f"{suggest_name(key, [nearest + key.removeprefix(root)])}"
+        )
 
 
 def _split_key(key: str) -> list[str]:

@@ -12,6 +12,10 @@ NAMED = "bar/tracking.scene.toml: "
 DESIRED = f"{NAMED}controller.desired"
 FINITE = "expected a finite number"
 JOINTS = "theta_1, theta_3"
+SHAPES = (
+    "controller.K_D: expected a number, a table by joint, a list of 2 numbers (the diagonal) or a 2 x 2 matrix "
+    f"in the order {JOINTS}"
+)
 PENDULUM = """<robot name="p"><link name="a"/><link name="b"><inertial><mass value="1"/><origin xyz="1 0 0"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <joint name="swing" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
@@ -48,10 +52,12 @@ GAINS = [
     _value("K_D=nan", f"{NAMED}controller.K_D = nan: {FINITE}"),
     _value("K_D=-1", "K_D is not positive definite: its smallest eigenvalue is -1"),
     _value("K_D=0", "K_D is not positive definite: its smallest eigenvalue is 0"),
-    _value("K_D=[1.0, 2.0]", "controller.K_D[0] = 1.0: expected a list, got a number"),
-    _value("K_D=[]", "controller.K_D: a matrix must be 2 x 2", f"in the order {JOINTS}"),
-    _value("K_D=[[1.0]]", "controller.K_D: a matrix must be 2 x 2"),
-    _value("K_D=[[1.0, 0.0], [1.0]]", "controller.K_D: a matrix must be 2 x 2"),
+    _value("K_D=[1.0, 2.0, 3.0]", f"{SHAPES}, got a list of 3 numbers"),
+    _value("K_D=[1.0, [2.0, 3.0]]", f"{SHAPES}, got rows of different lengths"),
+    _value("K_D=[]", f"{SHAPES}, got a list of 0 numbers"),
+    _value("K_D=[[1.0]]", f"{SHAPES}, got a 1 x 1 matrix"),
+    _value("K_D=[[1.0, 0.0], [1.0]]", f"{SHAPES}, got rows of different lengths"),
+    _value("K_D=[1.0, -2.0]", "K_D is not positive definite: its smallest eigenvalue is -2"),
     _value('K_D=[[1.0, "a"], [0.0, 1.0]]', "controller.K_D[0][1] = 'a': expected a number"),
     _value("K_D=[[nan, 0.0], [0.0, 1.0]]", f"controller.K_D[0][0] = nan: {FINITE}"),
     _value("K_D=[[1.0, 0.5], [0.0, 1.0]]", "K_D is not symmetric: its entries [0][1] = 0.5 and [1][0] = 0 differ"),
