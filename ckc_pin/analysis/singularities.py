@@ -24,7 +24,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.kinematics.assembly import close_loops
+from ckc_pin.kinematics.closing import close_loops
 from ckc_pin.kinematics.continuation import MAX_NEWTON_STEP
 from ckc_pin.mechanism.closure import Closure, ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics

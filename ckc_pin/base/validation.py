@@ -31,7 +31,7 @@ __all__ = [
 
 SHORT_TYPES = (int, float, complex, str, bytes, type(None), np.generic)  # quoted in messages; others by their type
 MAX_QUOTED = 80  # characters of a value in a message
-MIN_SIMILARITY = 0.7  # of an unknown name and a valid one, from 0 to 1, for "did you mean"
+MIN_SIMILARITY = 0.65  # of an unknown name and a valid one, from 0 to 1, for "did you mean"
 
 
 def describe_value(value: Any) -> str:

@@ -58,6 +58,8 @@ class Mechanism(HasSummary):
     motors : Motors
     tree, closure, frames : Tree, Closure, Frames
     joints, springs : Joints, Springs
+    couplings : tuple of CouplingSpec
+        Of the mechanism file, then those of the URDFs' mimic joints.
     urdf : Element
         All trees merged into one <robot>, as Pinocchio read it.
     partition : Partition
@@ -85,7 +87,7 @@ class Mechanism(HasSummary):
         self.urdf = linkage.urdf.root
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
         self.joints, self.springs = linkage.joints, linkage.springs
-        self.points, self.size = linkage.points, linkage.size
+        self.points, self.size, self.couplings = linkage.points, linkage.size, linkage.couplings
         self.coordinates, self.n = self.tree.coordinates, self.tree.n
         self.q_tree, self.residual, self.tolerance = q_tree, residual, tolerance
         self.freedoms = freedoms

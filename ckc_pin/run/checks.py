@@ -19,6 +19,7 @@ from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import CkcError, InputError
+from ckc_pin.kinematics.loop_types import describe_locking_loops
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.warnings import describe_stop_violation, list_limit_violations
@@ -62,7 +63,9 @@ def require_runnable(
         with scene.sources.prefix_errors():
             _require_prescribable(scene, mechanism, controller)
     elif mechanism.d == 0:
-        raise InputError(f"{mechanism.name}: the loops leave no freedom (d = 0), so nothing can move")
+        locking = describe_locking_loops(mechanism)
+        reason = f"; {locking}" if locking else ""
+        raise InputError(f"{mechanism.name}: the loops leave no freedom (d = 0), so nothing can move{reason}")
     if mechanism.splits_root and (controller is not None or free or scene.spec.formulation != "dae"):
         raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
     start = find_start(mechanism, scene)

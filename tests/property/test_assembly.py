@@ -17,6 +17,7 @@ from tests.contract.sketches import FOUR_BAR, FOUR_BAR_LOOP
 from tests.property.mechanisms import closed_mechanism
 from tests.property.worlds import random_world
 
+LIMIT = '<limit lower="-9" upper="9" effort="1" velocity="1"/>'
 INERTIAL = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
@@ -87,7 +88,7 @@ def coupled(folder: Path, mimics: dict[str, tuple[str, float, float]], guess: st
         mimic = '<mimic joint="{}" multiplier="{}" offset="{}"/>'.format(*mimics[name]) if name in mimics else ""
         joints += (
             f'<link name="{name}">{INERTIAL}</link><joint name="{name}" type="prismatic"><parent link="{parent}"/>'
-            f'<child link="{name}"/><axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="1" velocity="1"/>{mimic}</joint>'
+            f'<child link="{name}"/><axis xyz="0 0 1"/>{LIMIT}{mimic}</joint>'
         )
     (folder / "m.urdf").write_text(f'<robot name="slides"><link name="base"/>{joints}</robot>')
     (folder / "mechanism.toml").write_text(f'name = "slides"\nurdf = "m.urdf"\nq_guess = {guess}\n')

@@ -21,7 +21,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.formats.draft import Draft, round_vector
 from ckc_pin.formats.urdf.elements import UrdfIndex
-from ckc_pin.kinematics.assembly import close_loops
+from ckc_pin.kinematics.closing import close_loops
 from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Pose

@@ -1,0 +1,148 @@
+"""Close the loops of a tree near a guess by the damped Gauss-Newton method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array
+from ckc_pin.kinematics.continuation import MAX_NEWTON_STEP
+from ckc_pin.mechanism.closure import Closure
+from ckc_pin.mechanism.pose import Pose
+from ckc_pin.mechanism.tree import Tree
+
+__all__ = ["EXACT_TOLERANCE", "ROUNDED_TOLERANCE", "Assembly", "close_loops", "find_nearby"]
+
+RESTARTS = 20  # from perturbed guesses
+MAX_ITERATIONS = 100  # of the Gauss-Newton method
+EXACT_TOLERANCE = 1e-10  # mechanism sizes: largest |phi| of a closed mechanism whose numbers are exact
+ROUNDED_TOLERANCE = 1e-5  # the same with numbers rounded to six digits in the files: 2.35619 rad is off by 5e-6
+NEARBY_STEP = 0.02  # rad, or mechanism sizes: distance at which the rank near a closed configuration is computed
+NEARBY_COUNT = 2  # configurations at that distance
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Outcome of an assembly.
+
+    Attributes
+    ----------
+    q_tree : (nq,) array
+        The best configuration.
+    residual : float
+        Largest |phi| there, or excess over a bound.
+    largest_residuals : dict of str to float
+        Largest |phi| of each loop.
+    """
+
+    q_tree: Array
+    residual: float
+    largest_residuals: dict[str, float]
+
+
+def close_loops(
+    tree: Tree,
+    closure: Closure,
+    q_tree: Array,
+    free: Array,
+    tolerance: float,
+    restarts: int = RESTARTS,
+    bounds: tuple[Array, Array] | None = None,
+    rounded: float = 0.0,
+) -> Assembly:
+    """Close the loops near a guess by the damped Gauss-Newton method, with minimum-norm steps.
+
+    Parameters
+    ----------
+    tree, closure : Tree, Closure
+    q_tree : (nq,) array
+        The guess.
+    free : (n,) array of 0 or 1
+        1 for coordinates that may move. The others keep their guess.
+    tolerance : float
+        Largest |phi| that counts as closed.
+    restarts : int
+        Number of perturbed guesses to try if the guess itself does not lead to a closed configuration.
+    bounds : pair of (n,) arrays, or None
+        Bounds of the coordinates. The excess over a bound counts as a residual, in its own unit.
+    rounded : float
+        Largest |phi| that is accepted if rows contradict each other so much. Other guesses are not tried then, since
+        they would lead to a different configuration with a slightly smaller residual.
+
+    Returns
+    -------
+    Assembly
+        From the guess if that closes, otherwise from the first perturbed guess that closes, or the best one.
+    """
+
+    def evaluate(q: Array) -> tuple[Array, Callable[[], Array]]:
+        pose = Pose(tree, closure.anchors, q)
+        phi = closure.phi(pose)
+        if bounds is None:
+            return phi, lambda: closure.jacobian(pose) * free
+        numbers = tree.to_coordinates(q)
+        beyond = numbers - np.clip(numbers, *bounds)
+        rows = np.eye(tree.n)[beyond != 0]
+        return np.concatenate([phi, beyond[beyond != 0]]), lambda: np.vstack([closure.jacobian(pose), rows]) * free
+
+    def outcome(start: Array) -> tuple[Assembly, bool]:
+        """Return the assembly from a guess, and whether it is accepted."""
+        q = _gauss_newton(tree, start, evaluate, tolerance)
+        phi, _ = evaluate(q)
+        open_, excess = (float(np.abs(part).max(initial=0.0)) for part in np.split(phi, [closure.rows]))
+        assembly = Assembly(q, max(open_, excess), closure.largest_residuals(phi[: closure.rows]))
+        return assembly, open_ <= max(tolerance, rounded) and excess <= tolerance
+
+    random = np.random.default_rng(0)  # a fixed seed, so that the result is reproducible
+    best, closed = outcome(q_tree)
+    for attempt in range(restarts):
+        if closed:
+            break
+        spread = 0.1 * 1.4**attempt
+        trial, closed = outcome(
+            tree.integrate(q_tree, free * tree.step_scale * random.uniform(-spread, spread, tree.n))
+        )
+        if closed or trial.residual < best.residual:
+            best = trial
+    return best
+
+
+def _gauss_newton(
+    tree: Tree, q: Array, evaluate: Callable[[Array], tuple[Array, Callable[[], Array]]], tolerance: float
+) -> Array:
+    """Minimize |phi| by minimum-norm Newton steps, each shortened until |phi| decreases.
+
+    `evaluate` returns phi and a function that returns its Jacobian.
+    """
+    phi, jacobian = evaluate(q)
+    for _ in range(MAX_ITERATIONS):
+        if np.abs(phi).max(initial=0.0) <= 1e-3 * tolerance:
+            break
+        part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.step_scale, phi, rcond=1e-6)[0], dtype=float)
+        longest, step = float(np.abs(part).max(initial=0.0)), part * tree.step_scale
+        scale = min(1.0, MAX_NEWTON_STEP / longest) if longest > 0 else 0.0
+        while scale > 1e-6:
+            trial = tree.integrate(q, scale * step)
+            phi_trial, jacobian_trial = evaluate(trial)
+            if np.linalg.norm(phi_trial) < (1 - 1e-4 * scale) * np.linalg.norm(phi):
+                q, phi, jacobian = trial, phi_trial, jacobian_trial
+                break
+            scale /= 2
+        else:
+            break
+    return q
+
+
+def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
+    """Return closed configurations a small step along the tangent space, if there are any."""
+    random = np.random.default_rng(0)
+    configurations = []
+    for _ in range(NEARBY_COUNT if len(tangent) else 0):
+        step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
+        step *= NEARBY_STEP / np.abs(step).max() * tree.step_scale
+        closed = close_loops(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
+        if closed.residual <= 10 * accept:
+            configurations.append(closed.q_tree)
+    return configurations
