@@ -22,12 +22,11 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.control.workspace import DesiredCheck
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import load
-from ckc_pin.kinematics.loop_types import describe_locking_loops
 from ckc_pin.kinematics.sigma import assembly_branches
 from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints, find_model_warnings
+from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints
 from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable
 from ckc_pin.scene.initial import Start
 from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
@@ -227,14 +226,9 @@ def _check_mechanism(mechanism: Mechanism, warnings: list[str]) -> Check:
         mass=mass,
         inertia=inertia,
         joints=describe_joints(mechanism),
-        warnings=(*mechanism.warnings, *_describe_lock(mechanism), *find_model_warnings(mechanism), *warnings),
+        warnings=(*mechanism.warnings, *warnings),
         terms=terms,
     )
-
-
-def _describe_lock(mechanism: Mechanism) -> list[str]:
-    locking = describe_locking_loops(mechanism)
-    return [f"the loops leave no freedom (d = 0): {locking}"] if locking else []
 
 
 def _check_scene(scene: Scene, mechanism: Mechanism) -> Check:

@@ -146,9 +146,8 @@ def find_nearest_name(name: str, names: Iterable[str], min_similarity: float = 0
     from difflib import SequenceMatcher  # imported here because input without errors does not need it
 
     def similarity(other: str) -> float:
-        return max(
-            SequenceMatcher(None, name, other).ratio(), SequenceMatcher(None, _plain(name), _plain(other)).ratio()
-        )
+        pairs = ((name, other), (_fold_case(name), _fold_case(other)))
+        return max(SequenceMatcher(None, *pair).ratio() for pair in pairs)
 
     best = max(names, key=similarity, default=None)
     return best if best is not None and similarity(best) >= min_similarity else None
@@ -163,5 +162,5 @@ def suggest_name(name: Any, names: Iterable[Any]) -> str:
     return f"; did you mean {nearest!r}?" if is_similar else f"; the nearest is {nearest!r}"
 
 
-def _plain(name: str) -> str:
+def _fold_case(name: str) -> str:
     return name.casefold().replace("_", "").replace("-", "")

@@ -83,7 +83,8 @@ def run(
     options.require_folder(out, figures)
     _require_meshcat_for_view_options(meshcat, speed, port, open_browser)
     scene = ckc_pin.load_scene(what, options.read_overrides("--set", overrides))
-    for warning in run_warnings(scene):
+    warnings = run_warnings(scene)
+    for warning in warnings:
         error_console().print(f"warning: {warning}")
     if out is not None:
         make_folder(out)
@@ -92,6 +93,7 @@ def run(
         with ProgressBar(scene.name) as progress:
             on_output = None if view is None else view.on_output
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
+        finished = finished.with_warnings(warnings)
         code = _save_and_print(finished, out, figures, profile, as_json)
         if view is not None and finished.status != "interrupted":
             try:

@@ -11,7 +11,7 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.kinematics.closing import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Assembly, close_loops, find_nearby
-from ckc_pin.kinematics.loop_types import list_closing_types
+from ckc_pin.kinematics.loop_types import describe_locking_loops, list_closing_types
 from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -19,6 +19,7 @@ from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import count_freedoms
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
+from ckc_pin.mechanism.warnings import find_model_warnings
 
 __all__ = ["assemble_mechanism"]
 
@@ -42,7 +43,12 @@ def assemble_mechanism(
         guess = tree.vector({**spec.q_guess, **(prescribed or {})}, tree.coordinates, "q_guess", fill=0.0)
         guess = _apply_couplings(linkage, guess)
         mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess)))
-        return mechanism if linkage.spec.independent is not None else _restore_guess(linkage, mechanism)
+        if linkage.spec.independent is None:
+            mechanism = _restore_guess(linkage, mechanism)
+        if locking := describe_locking_loops(mechanism):
+            mechanism.warnings.append(f"the loops leave no freedom (d = 0): {locking}")
+        mechanism.warnings += find_model_warnings(mechanism)
+        return mechanism
 
 
 def _create_mechanism(linkage: Linkage, closed: Assembly, independent: tuple[str, ...] | None = None) -> Mechanism:
@@ -66,23 +72,23 @@ def _apply_couplings(linkage: Linkage, guess: Array) -> Array:
     The master follows instead if only the follower has an entry in q_guess, and neither if both have one.
     """
     tree, guess = linkage.tree, guess.copy()
-    known, pending = set(linkage.spec.q_guess), list(linkage.couplings)
+    placed, pending = set(linkage.spec.q_guess), list(linkage.couplings)
     while pending:
-        coupling = _next_coupling(pending, known)
+        coupling = _next_coupling(pending, placed)
         pending.remove(coupling)
         joint, other = tree.index[coupling.joint], tree.index[coupling.other]
-        if coupling.joint not in known:
+        if coupling.joint not in placed:
             guess[joint] = coupling.ratio * guess[other] + coupling.offset
-        elif coupling.other not in known and coupling.ratio != 0.0:
+        elif coupling.other not in placed and coupling.ratio != 0.0:
             guess[other] = (guess[joint] - coupling.offset) / coupling.ratio
-        known |= {coupling.joint, coupling.other}
+        placed |= {coupling.joint, coupling.other}
     return guess
 
 
-def _next_coupling(pending: list[CouplingSpec], known: set[str]) -> CouplingSpec:
+def _next_coupling(pending: list[CouplingSpec], placed: set[str]) -> CouplingSpec:
     """Return a coupling of a joint whose value is known, else one whose master follows no other joint."""
     for coupling in pending:
-        if coupling.joint in known or coupling.other in known:
+        if coupling.joint in placed or coupling.other in placed:
             return coupling
     followers = {coupling.joint for coupling in pending}
     return next((coupling for coupling in pending if coupling.other not in followers), pending[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from functools import cached_property
 from os.path import isdir, isfile
@@ -88,6 +89,9 @@ class Run(HasSummary):
         The scene with all defaults filled in.
     texts : dict of str to str
         The mechanism file and every file that it or the scene names.
+    warnings : tuple of str
+        About the mechanism, the start, a desired motion that left the workspace, and motors above their speed limit.
+        `ckc run` adds what `ckc_pin.check` finds by following the desired motion ahead.
     profile : dict
         Evaluated terms with their number of calls and their time, if requested.
     """
@@ -114,6 +118,7 @@ class Run(HasSummary):
     scene_name: str
     scene: dict[str, Any]
     texts: dict[str, str]
+    warnings: tuple[str, ...] = ()
     profile: dict[str, Any] = field(default_factory=dict)
     built_mechanism: InitVar[Mechanism | None] = (
         None  # the simulated mechanism, so that `mechanism` need not rebuild it
@@ -169,9 +174,8 @@ class Run(HasSummary):
                 u_unit, tau_unit = f" {joined(by_quantity['u'])}", f" {joined(by_quantity['tau'])}"
             u, tau = _largest_finite(self.u), _largest_finite(self.tau)
             rows.append(("largest |u|, |tau|", f"{u:.4g}{u_unit}, {tau:.4g}{tau_unit}"))
-        for name, rate in ({} if mechanism is None else self.too_fast()).items():
-            limit = self.mechanism.motors.speed_limit[self.actuated.index(name)]
-            rows.append(("warning", f"{name} turns at {rate:.4g}, its speed_limit is {limit:.4g}"))
+        speed_warnings = [] if mechanism is None else self.list_speed_warnings()
+        rows += [("warning", warning) for warning in dict.fromkeys((*self.warnings, *speed_warnings))]
         rows.append(("energy start, end", f"{self.energy[0]:.9g}, {self.energy[-1]:.9g} J"))
         if self.dissipated is not None:
             rows.append(("friction, impacts took", f"{self.dissipated[-1]:.9g} J"))
@@ -308,6 +312,19 @@ class Run(HasSummary):
         rates = zip(motors.names, largest, motors.speed_limit, strict=True)
         return {name: float(rate) for name, rate, limit in rates if rate > limit}
 
+    def list_speed_warnings(self) -> list[str]:
+        """Return a warning for each motor that exceeds its speed limit."""
+        limits = dict(zip(self.actuated, self.mechanism.motors.speed_limit, strict=True))
+        return [
+            f"{name} turns at {x:.4g}, its speed_limit is {limits[name]:.4g}" for name, x in self.too_fast().items()
+        ]
+
+    def with_warnings(self, warnings: Sequence[str]) -> Run:
+        """Return the run with further warnings, each of them once."""
+        merged = tuple(dict.fromkeys((*self.warnings, *warnings)))
+        simulated: Mechanism | None = self._built_mechanism  # type: ignore[attr-defined]
+        return self if merged == self.warnings else replace(self, warnings=merged, built_mechanism=simulated)
+
     def loop_forces(self) -> dict[str, Array]:
         """Return the multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
 
@@ -323,6 +340,7 @@ class Run(HasSummary):
         return {
             "status": self.status,
             "message": self.message,
+            "warnings": list(self.warnings),
             "t": float(self.t[-1]),
             "coordinates": list(self.coordinates),
             "q_tree": self.q_tree[-1].tolist(),

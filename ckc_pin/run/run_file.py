@@ -45,6 +45,7 @@ class RunMeta(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     scene_name: str
     scene: dict[str, Any]
     texts: dict[str, str]
+    warnings: tuple[str, ...] = ()  # old files have no such key
     profile: dict[str, Any]
 
 

@@ -24,6 +24,7 @@ from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
 from ckc_pin.run.stop_reasons import PAUSE_S, describe_stop
+from ckc_pin.run.warnings import add_cause, find_exit, start_warnings
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
@@ -92,14 +93,21 @@ def simulate(
 def run_prepared(prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run a prepared scene from its start; errors as of `simulate`."""
     started = perf_counter()  # Loading and assembling do not count as time of the run.
-    rows, status, message = record_rows(prepared, progress, on_output)
-    return build_run(prepared, rows, status=status, message=message, wall_s=perf_counter() - started)
+    warnings = start_warnings(prepared)
+    rows, status, message = record_rows(prepared, progress, on_output, warnings)
+    wall_s = perf_counter() - started
+    return build_run(prepared, rows, status=status, message=message, wall_s=wall_s, warnings=warnings)
 
 
 def record_rows(
-    prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None
+    prepared: Prepared,
+    progress: Progress | None = None,
+    on_output: OnOutput | None = None,
+    warnings: list[str] | None = None,
 ) -> tuple[Array, Status, str]:
     """Run a prepared scene and return the recorded rows, the status and the message of the run.
+
+    With `warnings`, a stop is explained: the desired motion is followed up to there, and warnings about it are added.
 
     Returns
     -------
@@ -116,11 +124,13 @@ def record_rows(
         )
     prepared.begin()
     loop.record(times, rows)
-    status, message, filled = _advance_to_end(prepared, rows, progress, on_output)
+    status, message, filled = _advance_to_end(prepared, rows, progress, on_output, warnings)
     return rows[:filled], status, message
 
 
-def build_run(prepared: Prepared, rows: Array, *, status: Status, message: str, wall_s: float) -> Run:
+def build_run(
+    prepared: Prepared, rows: Array, *, status: Status, message: str, wall_s: float, warnings: Sequence[str] = ()
+) -> Run:
     """Return the `Run` of recorded rows; `wall_s` is the time that it took, s."""
     scene, mechanism, loop = prepared.scene, prepared.mechanism, prepared.loop
     parts = _split_rows(prepared, rows)
@@ -142,15 +152,20 @@ def build_run(prepared: Prepared, rows: Array, *, status: Status, message: str, 
         scene_name=scene.name,
         scene=scene.to_dict(),
         texts=prepared.texts,
+        warnings=tuple(warnings),
         profile={name: {"calls": calls, "seconds": seconds} for name, (calls, seconds) in loop.profile().items()},
         built_mechanism=mechanism,
         **parts,
     )
-    return run
+    return run.with_warnings(run.list_speed_warnings())
 
 
 def _advance_to_end(
-    prepared: Prepared, rows: Array, progress: Progress | None, on_output: OnOutput | None
+    prepared: Prepared,
+    rows: Array,
+    progress: Progress | None,
+    on_output: OnOutput | None,
+    warnings: list[str] | None,
 ) -> tuple[Status, str, int]:
     """Advance the loop to t_end and return status, message and the number of recorded rows."""
     loop, solver, t_end = prepared.loop, prepared.scene.spec.solver, prepared.scene.spec.t_end
@@ -192,7 +207,12 @@ def _advance_to_end(
         error = describe_stop(stop, loop, prepared.mechanism, solver, prepared.events)
         if not filled:
             raise error
-        status, message = "stopped", _describe_error(error, loop.t)
+        is_budget = stop.reason in (StopReason.RHS_BUDGET, StopReason.WALL_BUDGET)
+        reason = str(error)
+        if warnings is not None and not is_budget:
+            reason, exit_warnings = add_cause(error, prepared, find_exit(prepared, loop.t))
+            warnings += exit_warnings
+        status, message = "stopped", _describe_error(error, reason, loop.t)
     loop.record_now()  # If the terms of this state cannot be evaluated, the last output instant is the end.
     return status, message, loop.filled
 
@@ -226,13 +246,16 @@ def _evaluate_lyapunov(prepared: Prepared, recorded: Array, parts: dict[str, Arr
     values = []
     for t, q_tree, v_tree, phi in zip(*(parts[name] for name in ("t", "q_tree", "v_tree", "phi")), strict=True):
         at = mechanism.kinematics(mechanism.tree.from_coordinates(q_tree))
-        value = function(float(t), Terms(mechanism, at, v_tree), phi)
+        try:
+            value = function(float(t), Terms(mechanism, at, v_tree), phi)
+        except NumericalError:  # A sampled run may end after the desired motion left the workspace.
+            value = np.nan
         values.append(require_number(value, f"controller: lyapunov at t = {float(t):.9g}"))
     return np.array(values)
 
 
-def _describe_error(error: NumericalError, t: float) -> str:
+def _describe_error(error: NumericalError, reason: str, t: float) -> str:
     where = ""
     if error.q_tree:
         where = " near " + ", ".join(f"{name} = {x:.6g}" for name, x in error.q_tree.items())
-    return f"stopped at t = {t:.6g} s{where}: {error}"
+    return f"stopped at t = {t:.6g} s{where}: {reason}"

@@ -12,7 +12,7 @@ from ckc_pin.native import Loop, RhsFailure, Stop, StopReason
 from ckc_pin.run.events import EventFunction
 from ckc_pin.scene.spec import SolverSpec
 
-__all__ = ["PAUSE_S", "describe_singular_phi_z", "describe_stop"]
+__all__ = ["PAUSE_S", "STEP_TOO_SMALL", "describe_singular_phi_z", "describe_stop"]
 
 PAUSE_S = 0.05  # longest time that the native loop keeps the interpreter, and with it Ctrl-C, waiting, s
 SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one instant; relative to t, or s
@@ -20,8 +20,9 @@ SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one inst
 NEARLY_SINGULAR = 1e-3
 FRICTION_REMEDY = "a scene with friction_smoothing has no sticking, and a smaller solver.rtol may tell the joints apart"
 
+STEP_TOO_SMALL = "the step size became so small that t does not change any more"
 STEP_FAILURES = {
-    RhsFailure.NONE: "the step size became so small that t does not change any more",
+    RhsFailure.NONE: STEP_TOO_SMALL,
     RhsFailure.LOOPS_OPEN: "sigma(q) does not converge: the loops cannot be kept closed on the way",
     RhsFailure.RANK_LOST: (
         "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere"

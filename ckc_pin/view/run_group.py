@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,7 +16,7 @@ from ckc_pin.base.validation import require_type
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
@@ -86,7 +87,10 @@ def compute_desired_path(run: Run) -> DesiredPath | None:
         return DesiredPath("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
     sources = Sources(run.scene_name, None, run.texts)
     desired: Desired = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
-    samples = np.array([desired(float(t))[:2] for t in run.t])
+    samples = np.full((len(run.t), 2, len(run.independent)), np.nan)
+    for k, t in enumerate(run.t):
+        with suppress(NumericalError):  # The path of a point has left the workspace; nothing is drawn from there on.
+            samples[k] = desired(float(t))[:2]
     return DesiredPath("tracking", samples[:, 0], samples[:, 1])
 
 
@@ -115,9 +119,9 @@ def compute_desired_poses(run: Run, rows: IntArray) -> DesiredPoses | None:
     kinematics = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[rows[0]]))
     poses, is_reachable = [], []
     for q_d in desired.q[rows]:
-        solution = sigma(mechanism, q_d, kinematics)
-        is_reachable.append(solution.verdict == "converged")
-        kinematics = solution.at if is_reachable[-1] else kinematics
+        solution = sigma(mechanism, q_d, kinematics) if np.all(np.isfinite(q_d)) else None
+        is_reachable.append(solution is not None and solution.verdict == "converged")
+        kinematics = solution.at if solution is not None and is_reachable[-1] else kinematics
         poses.append(kinematics.q_tree)
     return DesiredPoses(np.array(poses), np.array(is_reachable))
 

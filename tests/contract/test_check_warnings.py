@@ -209,8 +209,8 @@ def test_distance_of_a_slide_from_the_guess_is_relative_to_the_size(tmp_path: Pa
             f'frame_a = "block"\nframe_b = {{link = "world", xyz = [{reach}, 1.0, 0.0]}}\n',
             encoding="utf-8",
         )
-        said = [warning.partition("from q_guess: ")[2] for warning in check(tmp_path / "mechanism.toml").warnings]
-        assert said == far
+        texts = check(tmp_path / "mechanism.toml").warnings
+        assert [text.partition("from q_guess: ")[2] for text in texts if "from q_guess: " in text] == far
 
 
 def test_start_outside_joint_limits_is_named(bar: Path) -> None:
