@@ -121,8 +121,7 @@ class Check(HasSummary):
             rows.append(("det phi_z", f"{self.det_phi_z:.6g}"))
         rows += [
             ("sigma_min(phi_z), cond", f"{self.sigma_min_phi_z:.6g}, {self.cond_phi_z:.4g}"),
-            ("size", f"{self.size:.4g} m, the largest distance between joints"),
-            ("moving mass", f"{self.mass:.6g} kg"),
+            ("size, moving mass", f"{self.size:.4g} m, {self.mass:.6g} kg"),
             ("its inertia, kg m²", inertia),
             ("", "as assembled, about its centre of mass, world's axes"),
             ("terms", self.terms),

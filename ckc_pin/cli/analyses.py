@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -55,13 +55,13 @@ MODEL_FILES = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # of an ear
 @options.out(help="Folder for inverse.npz.")
 @options.figures
 @options.as_json
-def inverse(what: str, overrides: tuple[str, ...], out: Path | None, figures: bool, as_json: bool) -> None:
+def inverse(what: str, overrides: dict[str, Any], out: Path | None, figures: bool, as_json: bool) -> None:
     """Compute motor, loop and joint forces along a motion. It is a scene's desired motion, or that of a run."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
     with ProgressBar(what) as progress:
-        forces = ckc_pin.inverse_dynamics(what, options.read_overrides("--set", overrides), progress=progress)
+        forces = ckc_pin.inverse_dynamics(what, overrides, progress=progress)
     if out is not None:
         _save_forces(forces, out, figures)
     if as_json:
@@ -119,7 +119,7 @@ def _save_forces(forces: ckc_pin.MotionForces, out: Path, figures: bool) -> None
 )
 @options.as_json
 def linearize(
-    what: str, at: str | None, period: float | None, overrides: tuple[str, ...], out: Path | None, as_json: bool
+    what: str, at: str | None, period: float | None, overrides: dict[str, Any], out: Path | None, as_json: bool
 ) -> None:
     """Compute A, B, C, D and modes in minimal coordinates. The model is exact, about rest or along a run."""
     if at is not None and period is not None:
@@ -128,16 +128,15 @@ def linearize(
         )
     if out is not None:
         make_folder(out)
-    values = options.read_overrides("--set", overrides)
     if period is not None:
         with ProgressBar(what) as progress:
-            orbit = ckc_pin.floquet(what, period, values, progress)
+            orbit = ckc_pin.floquet(what, period, overrides, progress)
         if out is not None:
             _save_floquet(orbit, out)
         _print_model(orbit, out, as_json)
         return
     with Spinner(f"linearizing {what}"):
-        model = ckc_pin.linearize(what, _parse_operating_point("equilibrium" if at is None else at), values)
+        model = ckc_pin.linearize(what, _parse_operating_point("equilibrium" if at is None else at), overrides)
     playable, modes = 0 if out is None else _save_model(model, what, overrides, out), len(model.modes)
     reasons = "rigid modes, modes that the loops do not follow, and modes beyond the twelfth are left out"
     note = "" if playable == modes else f"; {playable} of {modes} modes can be played: {reasons}"
@@ -176,7 +175,7 @@ def _save_floquet(orbit: ckc_pin.Floquet, out: Path) -> None:
         orbit.run.save(out / "run.npz")
 
 
-def _save_model(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...], out: Path) -> int:
+def _save_model(model: ckc_pin.LinearModel, what: str, overrides: dict[str, Any], out: Path) -> int:
     """Replace the files of an earlier model while signals are deferred, then draw figures.
 
     Returns the number of modes that were saved as runs.
@@ -196,7 +195,7 @@ def _save_model(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...
                 run.save(out / f"mode_{number}.npz")
         locus = None
         try:
-            locus = ckc_pin.gain_locus(what, overrides=options.read_overrides("--set", overrides))
+            locus = ckc_pin.gain_locus(what, overrides=overrides)
         except CkcError as error:
             error_console().print(f"no root locus: {error}")
         with skip_figures_without_matplotlib():
@@ -228,14 +227,14 @@ def _save_model(model: ckc_pin.LinearModel, what: str, overrides: tuple[str, ...
 @options.figures
 @options.as_json
 def sensitivities(
-    scene: str, parameters: tuple[str, ...], overrides: tuple[str, ...], out: Path | None, figures: bool, as_json: bool
+    scene: str, parameters: tuple[str, ...], overrides: dict[str, Any], out: Path | None, figures: bool, as_json: bool
 ) -> None:
     """Compute parameter derivatives of a run. They are exact, also through impacts and sticking."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
     with ProgressBar(scene) as progress:
-        result = ckc_pin.sensitivities(scene, parameters, options.read_overrides("--set", overrides), progress)
+        result = ckc_pin.sensitivities(scene, parameters, overrides, progress)
     if out is not None:
         _save_sensitivities(result, out, figures)
     if as_json:

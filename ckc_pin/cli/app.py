@@ -25,6 +25,7 @@ Begin with
   ckc run five_bar/tracking --out runs/first   simulate, and save run.npz in the folder
   ckc play runs/first                          play the run in the browser
   ckc plot runs/first --out figures            draw figures of the run
+  ckc keys motor                               print the keys of a table
   ckc new mine                                 create a folder with a mechanism to start from
   ckc COMMAND --help                           describe a command, with examples
 """
@@ -37,6 +38,7 @@ COMPLETE_VARIABLE = "_CKC_COMPLETE"
 COMMANDS = {
     "new": "files:new",
     "list": "inspection:list_",
+    "keys": "keys:keys",
     "check": "inspection:check",
     "terms": "inspection:terms",
     "compile": "inspection:compile_",

@@ -62,14 +62,14 @@ def list_(as_json: bool) -> None:
 @options.overrides
 @click.option("--branches", is_flag=True, help="Also list the assembly branches.")
 @options.as_json
-def check(what: str, overrides: tuple[str, ...], branches: bool, as_json: bool) -> None:
+def check(what: str, overrides: dict[str, Any], branches: bool, as_json: bool) -> None:
     """Report freedoms, rank, redundant rows, partition.
 
     For a scene it also reports whether a run can start, whether the desired trajectory stays in the workspace, and
     whether the controller is stable at the target or along the trajectory.
     """
     with Spinner(f"checking {what}"):
-        result = ckc_pin.check(what, options.read_overrides("--set", overrides), branches=branches)
+        result = ckc_pin.check(what, overrides, branches=branches)
     if as_json:
         print_json(result.to_dict())
     else:

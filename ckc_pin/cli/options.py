@@ -10,9 +10,9 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,13 +79,6 @@ def _complete(names: list[str], incomplete: str) -> list[CompletionItem]:
 # --- declarations --------------------------------------------------------------------------------
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-overrides = click.option(
-    "--set",
-    "overrides",
-    metavar="KEY=VALUE",
-    multiple=True,
-    help="Override a key of the scene or a parameter of the mechanism. May be repeated.",
-)
 mechanism = click.argument(
     "mechanism", metavar="MECHANISM", shell_complete=complete_mechanisms, help="A shipped name, a folder or a file."
 )
@@ -102,6 +95,32 @@ figures = click.option("--figures", is_flag=True, help="With --out: also draw fi
 out = partial(click.option, "--out", metavar="DIR", type=PATH)
 port = click.option("--port", metavar="PORT", type=int, default=0, help="Port on 127.0.0.1; 0: any free one.")
 open_browser = click.option("--open", "open_browser", is_flag=True, help="Also open the default browser.")
+
+
+def overrides(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options --set and --unset to a command, which gets both as one table `overrides`; None removes a key."""
+
+    @click.option(
+        "--set",
+        "settings",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help="Override a key of the scene or a parameter of the mechanism. May be repeated.",
+    )
+    @click.option(
+        "--unset", "removed", metavar="KEY", multiple=True, help="Remove a key of the scene. May be repeated."
+    )
+    @wraps(command)
+    def with_overrides(*args: Any, settings: tuple[str, ...], removed: tuple[str, ...], **options: Any) -> Any:
+        values = read_overrides("--set", settings)
+        for key in removed:
+            if key in values:
+                raise InputError(f"--unset {key}: --set gives it a value; leave one of them out")
+            if "=" in key or not all(part.strip() for part in key.split(".")):
+                raise InputError(f"--unset {key}: write KEY, e.g. controller.torque_limit")
+        return command(*args, overrides=values | dict.fromkeys(removed), **options)
+
+    return with_overrides
 
 
 def format_examples(*lines: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -58,11 +58,11 @@ MAX_FILE_NAME = 60  # characters of a scene's name in a file name
 @click.option("--budget", metavar="SECONDS", type=float, default=20.0, help="Time limit for each scene.")
 @options.out(help="Folder for report.md, rows.csv and the figures.")
 @options.as_json
-def report(scenes: tuple[str, ...], overrides: tuple[str, ...], budget: float, out: Path | None, as_json: bool) -> None:
+def report(scenes: tuple[str, ...], overrides: dict[str, Any], budget: float, out: Path | None, as_json: bool) -> None:
     """Measure error against run time of scenes. Compares formulations, methods, tolerances, and recommends settings."""
     if not 0 < budget < float("inf"):
         raise InputError(f"--budget {budget:g}: expected a number of seconds above zero")
-    loaded = [ckc_pin.load_scene(name, options.read_overrides("--set", overrides)) for name in scenes]
+    loaded = [ckc_pin.load_scene(name, overrides) for name in scenes]
     mechanisms = [prepare(scene).mechanism for scene in loaded]  # Invalid scenes are reported before the first run.
     if out is not None:
         make_folder(out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +68,7 @@ __all__ = ["format_profile", "play", "plot", "run"]
 @options.as_json
 def run(
     what: str,
-    overrides: tuple[str, ...],
+    overrides: dict[str, Any],
     out: Path | None,
     figures: bool,
     profile: bool,
@@ -82,7 +83,7 @@ def run(
 
     options.require_folder(out, figures)
     _require_meshcat_for_view_options(meshcat, speed, port, open_browser)
-    scene = ckc_pin.load_scene(what, options.read_overrides("--set", overrides))
+    scene = ckc_pin.load_scene(what, overrides)
     warnings = run_warnings(scene)
     for warning in warnings:
         error_console().print(f"warning: {warning}")
@@ -94,7 +95,7 @@ def run(
             on_output = None if view is None else view.on_output
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
         finished = finished.with_warnings(warnings)
-        code = _save_and_print(finished, out, figures, profile, as_json)
+        code = _save_and_print(finished, out, figures, profile, as_json, warnings)
         if view is not None and finished.status != "interrupted":
             try:
                 view.finish(finished, stay=True)
@@ -104,15 +105,21 @@ def run(
         raise click.exceptions.Exit(code)
 
 
-def _save_and_print(finished: ckc_pin.Run, out: Path | None, figures: bool, profile: bool, as_json: bool) -> int:
-    """Save and print a run; return the exit code."""
+def _save_and_print(
+    finished: ckc_pin.Run, out: Path | None, figures: bool, profile: bool, as_json: bool, printed: list[str]
+) -> int:
+    """Save and print a run; return the exit code. Warnings that were printed before the run are not repeated."""
     stop = _save(finished, out, figures) if out is not None else None
     if profile:
         error_console().print(format_profile(finished))
     if as_json:
         print_json(finished.to_dict())
     else:
-        print_summary(finished.summary())
+        summary = finished.summary()
+        is_new = [row[0] != "warnings" and row[1] not in printed for row in summary.rows]
+        print_summary(
+            replace(summary, rows=[row for row, is_kept in zip(summary.rows, is_new, strict=True) if is_kept])
+        )
         print(format_destination(out, "the run, for ckc play, plot and inverse"))
     sys.stdout.flush()  # A live view may keep the command running.
     if finished.status != "done":
@@ -183,12 +190,19 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
         "ckc play runs/spf",
         "ckc play runs/reduced runs/spf --speed 0.5 --gap 1000",
         "ckc play runs/spf --html spf.html",
-        "ckc play runs/reduced runs/spf --gif both.gif",
+        "ckc play runs/reduced runs/spf --video both.gif",
     )
 )
 @options.runs
 @click.option("--html", metavar="FILE", type=options.PATH, help="Write an HTML file that plays from disk instead.")
-@click.option("--gif", metavar="FILE", type=options.PATH, help="Write an animated line drawing instead.")
+@click.option(
+    "--video",
+    "--gif",
+    "video",
+    metavar="FILE",
+    type=options.PATH,
+    help="Write an animated line drawing instead, as GIF. The player in the browser records other formats.",
+)
 @click.option("--speed", metavar="FACTOR", type=float, default=1.0, help="Playback speed, 1 is real time.")
 @click.option("--gap", metavar="FACTOR", type=float, default=0.0, help="Draw the loops' gaps, magnified by a factor.")
 @click.option("--forces", is_flag=True, help="Draw the forces of loops and motors as arrows.")
@@ -198,7 +212,7 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
 def play(
     runs: tuple[Path, ...],
     html: Path | None,
-    gif: Path | None,
+    video: Path | None,
     speed: float,
     gap: float,
     forces: bool,
@@ -208,14 +222,19 @@ def play(
 ) -> None:
     """Play runs in the browser, on this machine only. Several runs are drawn on top of each other."""
     options.require_speed(speed)
-    if gif is not None and (html is not None or gap or forces or meshes is not None):
-        raise InputError("--gif goes with --speed only; leave out --html, --gap, --forces and --meshes")
+    if video is not None and video.suffix.lower() != ".gif":
+        raise InputError(
+            f"--video {video}: expected a name that ends in .gif, the only format that is written; "
+            f"ffmpeg -i {video.with_suffix('.gif').name} {video.name} converts it"
+        )
+    if video is not None and (html is not None or gap or forces or meshes is not None):
+        raise InputError("--video goes with --speed only; leave out --html, --gap, --forces and --meshes")
     loaded = [ckc_pin.Run.load(path) for path in runs]
-    if gif is not None:
+    if video is not None:
         from ckc_pin.view.gif import save_gif
 
-        with Spinner(f"writing {gif.name}"):
-            path = save_gif(loaded, gif, speed=speed)
+        with Spinner(f"writing {video.name}"):
+            path = save_gif(loaded, video, speed=speed)
         print_written([path])
         return
     if html is None:

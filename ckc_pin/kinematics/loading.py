@@ -103,6 +103,8 @@ def _check_overrides(overrides: Any) -> Overrides:
     require_table(overrides, "load: overrides", expected)
     checked: dict[str, Any] = {}
     for name, override in overrides.items():
+        if override is None:
+            raise InputError(f"{name}: only keys of a scene can be removed; a parameter of a mechanism needs a value")
         value = override.tolist() if isinstance(override, np.generic | np.ndarray) else override
         is_vector = isinstance(value, list | tuple)
         for x in value if is_vector else (value,):

@@ -111,6 +111,9 @@ class Locus:
 class Approach:
     """The closest approach of a trajectory to a locus, in the units of the map.
 
+    The distance is measured over the axes of the map. If the map has fixed coordinates, both are within its section:
+    the locus of other sections may be nearer, and the trajectory need not be in the section.
+
     Attributes
     ----------
     locus : int
@@ -251,6 +254,7 @@ class SingularityMap(HasSummary):
                 "leaves_at": path.leaves_at,
                 "closest_t": path.closest_t,
                 "sigma_min": path.sigma_min,
+                "within_section": bool(self.fixed),
                 "approaches": [
                     {
                         "locus": a.locus,

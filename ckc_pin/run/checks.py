@@ -125,17 +125,17 @@ def _require_prescribable(
 
 
 def run_warnings(scene: Scene) -> list[str]:
-    """Return warnings to print before a run: a start outside joint limits, a desired motion that cannot be followed."""
-    if scene.spec.controller is None:
-        return []
+    """Return warnings to print before a run: about the mechanism, the start and the desired motion."""
     mechanism = load_scene_mechanism(scene)
     try:
         start = find_start(mechanism, scene)
     except CkcError:  # The run reports this error itself.
-        return []
-    desired = check_desired(build_scene_controller(scene, mechanism), mechanism, scene.spec.t_end, start)
+        return mechanism.warnings
+    desired = None
+    if scene.spec.controller is not None:
+        desired = check_desired(build_scene_controller(scene, mechanism), mechanism, scene.spec.t_end, start)
     outside = limit_warnings(mechanism, start.at.q_tree, "the start")
-    return outside + desired_warnings(mechanism, desired, scene.spec.t_end)
+    return [*mechanism.warnings, *outside, *desired_warnings(mechanism, desired, scene.spec.t_end)]
 
 
 def check_desired(

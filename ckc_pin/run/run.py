@@ -174,8 +174,7 @@ class Run(HasSummary):
                 u_unit, tau_unit = f" {joined(by_quantity['u'])}", f" {joined(by_quantity['tau'])}"
             u, tau = _largest_finite(self.u), _largest_finite(self.tau)
             rows.append(("largest |u|, |tau|", f"{u:.4g}{u_unit}, {tau:.4g}{tau_unit}"))
-        speed_warnings = [] if mechanism is None else self.list_speed_warnings()
-        rows += [("warning", warning) for warning in dict.fromkeys((*self.warnings, *speed_warnings))]
+        rows += self._list_warnings(mechanism)
         rows.append(("energy start, end", f"{self.energy[0]:.9g}, {self.energy[-1]:.9g} J"))
         if self.dissipated is not None:
             rows.append(("friction, impacts took", f"{self.dissipated[-1]:.9g} J"))
@@ -186,6 +185,16 @@ class Run(HasSummary):
             rows.append(("", f"and {len(self.events) - MAX_EVENTS_SHOWN} more events"))
         outcome = self.message if self.message.startswith(self.status) else f"{self.status}: {self.message}"
         return Summary(f"Run of {self.scene_name}, {outcome}", rows)
+
+    def _list_warnings(self, mechanism: Mechanism | None) -> list[Row]:
+        """Return a row for each warning about the run, and one for those about its mechanism."""
+        of_mechanism = set() if mechanism is None else {*mechanism.warnings} & {*self.warnings}
+        speed_warnings = [] if mechanism is None else self.list_speed_warnings()
+        texts = [text for text in dict.fromkeys((*self.warnings, *speed_warnings)) if text not in of_mechanism]
+        rows: list[Row] = [("warning", text) for text in texts]
+        if of_mechanism:
+            rows.append(("warnings", f"{len(of_mechanism)} about the mechanism, in run.warnings and ckc check"))
+        return rows
 
     def _mechanism_or_none(self) -> Mechanism | None:
         """Return the mechanism, or None if the run's texts are damaged: a summary is printed all the same."""

@@ -16,7 +16,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary
-from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
+from ckc_pin.base.toml import convert, find_faults, join_dotted_keys, read_text, read_toml
 from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_table, require_type, suggest_name
 from ckc_pin.control.spec import ControllerSpec, FeedbackSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import InputError
@@ -343,16 +343,48 @@ def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[
     for key, value in overrides.items():
         _check_root(key)
         *tables, last = _split_key(f"parameters.{key}" if is_parameter(key) else key)
+        if value is None:
+            _remove_key(result, key, tables, last)
+            continue
         target = result
         for k, table in enumerate(tables):
             target = target.setdefault(table, {})
             if not isinstance(target, dict):
                 raise InputError(f"{key}: {'.'.join(tables[: k + 1])} is a value, not a table")
-        if value is None:
-            target.pop(last, None)
-        else:
-            target[last] = to_toml_value(value)
+        target[last] = to_toml_value(value)
     return result
+
+
+def _remove_key(data: dict[str, Any], key: str, tables: list[str], last: str) -> None:
+    """Remove a key from a scene's data, in place. A key that a scene may have and this one has not is no error.
+
+    Raises
+    ------
+    InputError
+        No scene has such a key, or the scene's table of names has no such entry.
+    """
+    target: Any = data
+    for table in tables:
+        target = target.get(table) if isinstance(target, dict) else None
+    if isinstance(target, dict) and last in target:
+        del target[last]
+        return
+    where = ".".join(tables)
+    if tuple(tables) in TABLES_BY_NAME:
+        names = ", ".join(target or {}) or "nothing"
+        raise InputError(
+            f"{key}: the scene has no such entry to remove; {where} has {names}{suggest_name(last, target or {})}"
+        )
+    probe: dict[str, Any] = deepcopy(data)
+    inner = probe
+    for table in tables:
+        inner[table] = inner.get(table) if isinstance(inner.get(table), dict) else {}
+        inner = inner[table]
+    inner[last] = None
+    for fault in find_faults(probe, SceneSpec):
+        *path, name = [*fault.path, fault.value]
+        if fault.kind == "unknown key" and [*tables, last][: len(path) + 1] == [*path, name]:
+            raise InputError(f"{key}: a scene has no such key to remove: {fault.sentence()}")
 
 
 def _check_root(key: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import ckc_pin
 
-__all__ = ["markdown", "names", "undocumented"]
+__all__ = ["markdown", "members_of", "names", "undocumented"]
 
 
 def names() -> dict[str, list[str]]:
@@ -47,11 +47,12 @@ def undocumented() -> list[str]:
     for name in ckc_pin.__all__:
         value = getattr(ckc_pin, name)
         missing += [name] if not inspect.getdoc(value) else []
-        missing += [f"{name}.{member}" for member, of in _members(value) if not inspect.getdoc(of)]
+        missing += [f"{name}.{member}" for member, of in members_of(value) if not inspect.getdoc(of)]
     return missing
 
 
-def _members(value: Any) -> Iterator[tuple[str, Any]]:
+def members_of(value: Any) -> Iterator[tuple[str, Any]]:
+    """Return the public methods and properties of a class, in the order of their definition."""
     if inspect.isclass(value):
         for member, of in vars(value).items():
             if not member.startswith("_") and (

@@ -119,8 +119,8 @@ def test_command_and_notebook_write_gifs(swing: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--html", "x.html"], "--gif goes with --speed only"),
-        (["--forces"], "--gif goes with --speed only"),
+        (["--html", "x.html"], "--video goes with --speed only"),
+        (["--forces"], "--video goes with --speed only"),
         (["--speed", "0.001"], "10001 frames, but a GIF may have 1200; choose speed 0.0083 or more"),
         (["--gif", "nowhere/x.gif"], "nowhere/x.gif: cannot be written"),
     ],

@@ -42,7 +42,7 @@ def test_size_is_printed_and_in_the_json(tmp_path: Path) -> None:
     """The longest distance in this four-bar is from the base's joint gamma to alpha, or along the coupler: 0.5 m."""
     path = str(write(tmp_path))
     assert ckc("check", path, "--json").json["size"] == 0.5
-    assert "size                    0.5 m" in ckc("check", path).out
+    assert "size, moving mass       0.5 m, 3 kg" in ckc("check", path).out
 
 
 def units(path: Path) -> str:

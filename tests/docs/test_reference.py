@@ -11,15 +11,17 @@ import pytest
 
 import ckc_pin
 from ckc_pin import errors
+from ckc_pin.base.key_reference import KeyTable, describe_structure
+from ckc_pin.cli.key_tables import FILES, tables
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, OTHERS
-from scripts.site import api, commands, keys
+from scripts.site import api, commands, keys, reference_text
 from scripts.site.gallery import ROOT
 from scripts.site.insert import INSERTS, LINE
 from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
 from tests.contract.test_linearize_command import KEYS
 
-TABLES = [(file, table) for file in keys.FILES for table in keys.tables(file)]
+TABLES = [(file, table) for file in FILES for table in tables(file)]
 # Of keys that measure nothing. Every other number has a unit.
 WITHOUT_UNIT = {"axis_a", "axis_b", "restitution", "N", "rtol", "atol", "max_rhs", "direction", "seed", "weights",
                 "normal", "joints", "members", "count"}  # fmt: skip
@@ -30,7 +32,7 @@ def page(name: str) -> str:
 
 
 @pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
-def test_every_key_has_meaning_and_an_example_that_fits(file: str, table: keys.Table) -> None:
+def test_every_key_has_meaning_and_an_example_that_fits(file: str, table: KeyTable) -> None:
     assert table.about
     assert [key.name for key in table.keys if not key.documented] == []
     for key in table.keys:
@@ -40,12 +42,12 @@ def test_every_key_has_meaning_and_an_example_that_fits(file: str, table: keys.T
 
 
 @pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
-def test_a_docstring_describes_no_key_that_is_not_there(file: str, table: keys.Table) -> None:
-    assert set(keys.described(table.structure)[1]) == {key.name for key in table.keys}
+def test_a_docstring_describes_no_key_that_is_not_there(file: str, table: KeyTable) -> None:
+    assert set(describe_structure(table.structure)[1]) == {key.name for key in table.keys}
 
 
 @pytest.mark.parametrize(("file", "table"), TABLES, ids=lambda x: x if isinstance(x, str) else x.structure.__name__)
-def test_every_number_has_a_unit(file: str, table: keys.Table) -> None:
+def test_every_number_has_a_unit(file: str, table: KeyTable) -> None:
     numbers = [key for key in table.keys if "number" in key.kind or "integer" in key.kind]
     assert [
         key.name for key in numbers if not key.unit and key.name not in WITHOUT_UNIT and "ratio" not in key.name
@@ -69,12 +71,12 @@ def test_missing_keys_are_detected() -> None:
         b: str = ""
         c: int = 0
 
-    about, entries = keys.described(Spec)
+    about, entries = describe_structure(Spec)
     assert about == "A table."
     assert entries == {"a": ("m", "How long.", "a = 0.3"), "b": ("", "No example.", "")}
 
 
-@pytest.mark.parametrize("file", keys.FILES)
+@pytest.mark.parametrize("file", FILES)
 def test_a_page_has_every_key(file: str) -> None:
     text = keys.markdown(file)
     for name, table in TABLES:
@@ -93,6 +95,12 @@ def test_every_public_name_has_a_docstring() -> None:
     assert api.undocumented() == []
     assert sorted(name for named in api.names().values() for name in named) == sorted(ckc_pin.__all__)
     assert "% insert: api\n" in page("reference/api.md")
+
+
+@pytest.mark.parametrize("name", reference_text.texts())
+def test_committed_text_of_the_reference_is_current(name: str) -> None:
+    """If this fails, run `python -m scripts.site.reference_text`."""
+    assert (reference_text.FOLDER / name).read_text(encoding="utf-8") == reference_text.texts()[name]
 
 
 def test_every_insert_is_one_that_there_is() -> None:

@@ -11,10 +11,10 @@ import pytest
 import xarray as xr
 
 import ckc_pin
+from ckc_pin.cli.key_tables import tables
 from ckc_pin.mechanism.parameters import values_of, with_components
 from ckc_pin.run.columns import key_unit
 from ckc_pin.view import ensemble_figures
-from scripts.site import keys
 from tests.ensembles.test_damaged_results import convert_to_format_1
 
 URDF = Path(__file__).parents[2] / "urdf" / "slider_crank" / "slider_crank.urdf"
@@ -127,7 +127,7 @@ def test_units_match_the_reference(scene: Path) -> None:
     entries = {"joint": "joint.crank", "spring": "spring.1", "force": "force.0", "motor": "motor.crank"}
     compared = 0
     for file in ("mechanism", "scene"):
-        for table in keys.tables(file):
+        for table in tables(file):
             path = entries.get(table.path, "" if file == "mechanism" else table.path)
             for key in table.keys:
                 if key.unit and (path or file == "scene"):

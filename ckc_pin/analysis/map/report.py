@@ -104,12 +104,22 @@ def _path_table(result: SingularityMap, path: Path) -> list[Any]:
     else:
         outcome = f"stays inside; least sigma_min(phi_z) = {path.sigma_min:.4g} at t = {path.closest_t:.4f} s"
     unit = " or ".join(dict.fromkeys(axis.unit for axis in result.axes))
-    table = _make_table("closest to locus", f"distance ({unit})", "at t (s)", "desired there")
+    distance = "within section" if result.fixed else "distance"
+    table = _make_table("closest to locus", f"{distance} ({unit})", "at t (s)", "desired there")
     for a in path.approaches:
         place = "(" + ", ".join(f"{x:.5f}" for x in a.at) + ")"
         label = _short_label(result.loci[a.locus])
         table.add_row(f"{a.locus + 1}, {label}", f"{a.distance:.6f}", f"{a.t:.5f}", place)
-    return [Text(f"desired, {path.name}: {outcome}"), table]
+    parts: list[Any] = [Text(f"desired, {path.name}: {outcome}"), table]
+    if result.fixed:
+        fixed = ", ".join(f"{name} = {x:.4g}" for name, x in result.fixed.items())
+        parts.append(
+            Text(
+                f"Distances are over the axes only, within this section ({fixed}): in all of q the locus may be nearer "
+                "or further away. sigma_min(phi_z) is that of the motion itself."
+            )
+        )
+    return parts
 
 
 def _wrap(angle: float) -> float:
