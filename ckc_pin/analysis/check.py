@@ -27,7 +27,7 @@ from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints
-from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable
+from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable, start_warnings
 from ckc_pin.scene.initial import Start
 from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, is_scene_name, load_scene
@@ -240,7 +240,7 @@ def _check_scene(scene: Scene, mechanism: Mechanism) -> Check:
         error_message = str(error)
     desired = check_desired(controller, mechanism, spec.t_end, start)
     leaves_workspace = desired is not None and desired.leaves_at is not None
-    warnings = [] if start is None else limit_warnings(mechanism, start.at.q_tree, "the start")
+    warnings = [] if start is None else start_warnings(scene, mechanism, start)
     warnings += desired_warnings(mechanism, desired, spec.t_end)
     closed_loop = None
     if isinstance(controller, SetPoint | Tracking):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from statistics import median
 
 import numpy as np
 
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import values_of
+from ckc_pin.mechanism.parameters import Value, values_of
 
-__all__ = ["find_unit_warnings", "looks_like_degrees", "mention"]
+__all__ = ["describe_degrees", "find_unit_warnings", "looks_like_degrees"]
 
 MAX_MACHINE_M = 1000.0  # larger mechanisms are in millimetres whatever their mass
 LARGE_MACHINE_M = 10.0  # a mechanism of this size has more mass than MIN_MASS_PER_METRE
@@ -34,15 +34,22 @@ def looks_like_degrees(angle: float, largest: float = MAX_ANGLE) -> bool:
 
 def find_unit_warnings(mechanism: Mechanism) -> list[str]:
     """Return warnings that name the lengths which look like millimetres and the angles which look like degrees."""
-    warnings = []
-    if millimetres := mention(_find_long(mechanism)) or _describe_size(mechanism):
+    warnings, values = [], values_of(mechanism.spec, mechanism.urdf)
+    if millimetres := _mention(_find_long(mechanism, values)) or _describe_size(mechanism):
         warnings.append(f"lengths look like millimetres: {millimetres}; lengths are in metres")
-    if degrees := mention(_find_degrees(mechanism)):
-        warnings.append(f"angles look like degrees: {degrees}; angles are in radians")
-    return warnings
+    return warnings + _warn_of_degrees(list(_find_degrees(mechanism, values)))
 
 
-def mention(numbers: Iterator[str] | list[str]) -> str:
+def describe_degrees(angles: Mapping[str, float]) -> list[str]:
+    """Return a warning that names angles which look like degrees; none if there are none."""
+    return _warn_of_degrees([f"{name} = {x:g} rad" for name, x in angles.items()])
+
+
+def _warn_of_degrees(texts: list[str]) -> list[str]:
+    return [f"angles look like degrees: {_mention(texts)}; angles are in radians"] if texts else []
+
+
+def _mention(numbers: Iterator[str] | list[str]) -> str:
     """Return the first of several numbers with their names, and how many more there are."""
     listed = list(numbers)
     more = f" and {len(listed) - MAX_NAMED} more" if len(listed) > MAX_NAMED else ""
@@ -56,9 +63,8 @@ def _describe_size(mechanism: Mechanism) -> str:
     return ""
 
 
-def _find_long(mechanism: Mechanism) -> Iterator[str]:
+def _find_long(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[str]:
     """Name lengths many times longer than the others: a part of a file that is in millimetres."""
-    values = values_of(mechanism.spec, mechanism.urdf)
     lengths = {name: math.hypot(*x) for name, x in values.items() if isinstance(x, tuple) and _is_position(name)}
     lengths |= {name: x for name, x in values.items() if isinstance(x, float) and name.endswith("length")}
     usual = median([x for x in lengths.values() if x > 0] or [mechanism.size])
@@ -89,7 +95,7 @@ def _is_unlimited(lower: float, upper: float) -> bool:
     return lower == -upper and (upper in UNLIMITED or upper > UNLIMITED[-1])
 
 
-def _find_degrees(mechanism: Mechanism) -> Iterator[str]:
+def _find_degrees(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[str]:
     """Name limits, guesses and rest positions of revolute joints, and roll, pitch and yaw."""
     tree, spec = mechanism.tree, mechanism.spec
     angles = {name for name, unit in zip(tree.coordinates, tree.units(), strict=True) if unit == "rad"}
@@ -105,7 +111,7 @@ def _find_degrees(mechanism: Mechanism) -> Iterator[str]:
     for coupling in spec.coupling:
         if {coupling.joint, coupling.other} <= angles and looks_like_degrees(coupling.offset):
             yield f"offset of the coupling of {coupling.joint} = {coupling.offset:g} rad"
-    rotations = [(name, x) for name, x in values_of(spec, mechanism.urdf).items() if name.endswith(".rpy")]
+    rotations = [(name, x) for name, x in values.items() if name.endswith(".rpy")]
     rotations += [(f"tree {tree_.file}, rpy", tree_.rpy) for tree_ in spec.tree]
     for name, rotation in rotations:
         if isinstance(rotation, tuple) and any(MAX_ANGLE < abs(x) <= MAX_DEGREES for x in rotation):

@@ -15,6 +15,7 @@ from ckc_pin.control.controllers import (
     is_torque_controller,
 )
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.spec import SetPointSpec
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
@@ -22,12 +23,13 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loop_types import describe_locking_loops
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
+from ckc_pin.mechanism.unit_hints import describe_degrees, looks_like_degrees
 from ckc_pin.mechanism.warnings import describe_stop_violation, list_limit_violations
 from ckc_pin.scene.initial import Start, find_start, require_chart
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism, prescribed_motion
 from ckc_pin.scene.scene import Scene
 
-__all__ = ["check_desired", "desired_warnings", "limit_warnings", "require_runnable", "run_warnings"]
+__all__ = ["check_desired", "desired_warnings", "limit_warnings", "require_runnable", "run_warnings", "start_warnings"]
 
 # A desired motion gets a warning where sigma_min(phi_z) falls below this fraction of its value as assembled.
 SIGMA_MIN_WARNING_FRACTION = 0.1
@@ -134,8 +136,22 @@ def run_warnings(scene: Scene) -> list[str]:
     desired = None
     if scene.spec.controller is not None:
         desired = check_desired(build_scene_controller(scene, mechanism), mechanism, scene.spec.t_end, start)
-    outside = limit_warnings(mechanism, start.at.q_tree, "the start")
-    return [*mechanism.warnings, *outside, *desired_warnings(mechanism, desired, scene.spec.t_end)]
+    return [
+        *mechanism.warnings,
+        *start_warnings(scene, mechanism, start),
+        *desired_warnings(mechanism, desired, scene.spec.t_end),
+    ]
+
+
+def start_warnings(scene: Scene, mechanism: Mechanism, start: Start) -> list[str]:
+    """Return warnings of a start outside joint limits, and of a start or target that looks like degrees."""
+    units = dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
+    angles = {f"initial.q.{name}": x for name, x in scene.spec.initial.q.items() if units.get(name) == "rad"}
+    if isinstance(scene.spec.controller, SetPointSpec):
+        targets = scene.spec.controller.q_d
+        angles |= {f"controller.q_d.{name}": x for name, x in targets.items() if units.get(name) == "rad"}
+    degrees = describe_degrees({name: x for name, x in angles.items() if looks_like_degrees(x)})
+    return [*degrees, *limit_warnings(mechanism, start.at.q_tree, "the start")]
 
 
 def check_desired(

@@ -323,7 +323,10 @@ class Run(HasSummary):
 
     def list_speed_warnings(self) -> list[str]:
         """Return a warning for each motor that exceeds its speed limit."""
-        limits = dict(zip(self.actuated, self.mechanism.motors.speed_limit, strict=True))
+        speed_limit = self.mechanism.motors.speed_limit
+        if not np.isfinite(speed_limit).any():
+            return []
+        limits = dict(zip(self.actuated, speed_limit, strict=True))
         return [
             f"{name} turns at {x:.4g}, its speed_limit is {limits[name]:.4g}" for name, x in self.too_fast().items()
         ]

@@ -7,20 +7,19 @@ from ckc_pin.control.point_path import Circle, Line, PointPath
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import NumericalError
-from ckc_pin.run.checks import desired_warnings, limit_warnings
+from ckc_pin.run.checks import desired_warnings, start_warnings
 from ckc_pin.run.prepare import Prepared
 from ckc_pin.run.stop_reasons import STEP_TOO_SMALL
 
-__all__ = ["add_cause", "find_exit", "start_warnings"]
+__all__ = ["add_cause", "find_exit", "known_warnings"]
 
 LEAD = 1e-3  # of the time of a stop: a motion may stop so long before the exit of its desired motion
 EXIT_PHRASE = "leaves the workspace"  # in the error of a path of a point, which names the time itself
 
 
-def start_warnings(prepared: Prepared) -> list[str]:
+def known_warnings(prepared: Prepared) -> list[str]:
     """Return the warnings of a scene's mechanism and start, which are known without following the desired motion."""
-    mechanism = prepared.mechanism
-    return [*mechanism.warnings, *limit_warnings(mechanism, prepared.start.at.q_tree, "the start")]
+    return [*prepared.mechanism.warnings, *start_warnings(prepared.scene, prepared.mechanism, prepared.start)]
 
 
 def find_exit(prepared: Prepared, t: float) -> DesiredCheck | None:

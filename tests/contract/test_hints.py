@@ -109,6 +109,20 @@ def test_limits_of_whole_turns_and_unlimited_joints_cause_no_warning(limit: floa
     assert find_unit_warnings(load(path)) == []
 
 
+def test_start_and_target_in_degrees_are_named() -> None:
+    """In ckc check and in run.warnings."""
+    values = {
+        "initial": {"q": {"theta_1": -80.0, "theta_3": -100.0}},
+        "controller.q_d": {"theta_1": -1.0, "theta_3": -90},
+    }
+    warning = (
+        "angles look like degrees: initial.q.theta_1 = -80 rad, initial.q.theta_3 = -100 rad, "
+        "controller.q_d.theta_3 = -90 rad; angles are in radians"
+    )
+    assert warning in check("five_bar/set_point", values).warnings
+    assert warning in simulate("five_bar/set_point", values | {"t_end": 0.01}).warnings
+
+
 # --- loop types ------------------------------------------------------------------------------------
 
 
