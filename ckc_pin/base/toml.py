@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tomllib
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from datetime import date, datetime, time
 from pathlib import Path
@@ -210,8 +210,8 @@ class Fault(msgspec.Struct, frozen=True):
         Type or length of the value, if that is wrong.
     choices : tuple
         The valid keys or values, if there are few.
-    suggestion : str
-        Ends the message with the choice that the user probably meant.
+    suggestion : str or None
+        The most similar valid choice.
     """
 
     path: tuple[Step, ...]
@@ -220,7 +220,7 @@ class Fault(msgspec.Struct, frozen=True):
     expected: str = ""
     got: str = ""
     choices: tuple[Any, ...] = ()
-    suggestion: str = ""
+    suggestion: str | None = None
 
     def sentence(self, at: str = "") -> str:
         """Return the message; `at` is the place of the data in their file."""
@@ -234,7 +234,8 @@ class Fault(msgspec.Struct, frozen=True):
         expected = f": expected {self.expected}" if self.expected else ""
         expected += f", got {self.got}" if self.got else ""
         valid = f"; valid: {', '.join(choices)}" if self.choices else ""
-        return f"{head}{expected}{valid}{self.suggestion}"
+        nearest = "" if self.suggestion is None else suggest_name(self.value, [self.suggestion])
+        return f"{head}{expected}{valid}{nearest}"
 
 
 def find_faults(data: Any, kind: Any, path: tuple[Step, ...] = ()) -> Iterator[Fault]:
@@ -289,7 +290,7 @@ def _faults_of_table(data: Mapping[Any, Any], structs: Sequence[Any], path: tupl
             yield Fault(path, "missing key", tag_key, choices=tuple(tags))
             return
         if not isinstance(data[tag_key], str) or data[tag_key] not in tags:
-            suggestion = suggest_name(data[tag_key], tags)
+            suggestion = _find_nearest(data[tag_key], tags)
             yield Fault((*path, tag_key), "value", data[tag_key], choices=tuple(tags), suggestion=suggestion)
             return
         structs = [tags[data[tag_key]]]
@@ -302,14 +303,19 @@ def _faults_of_table(data: Mapping[Any, Any], structs: Sequence[Any], path: tupl
             nearest = find_nearest_name(name, [k for k in keys if k not in data], MIN_SIMILARITY)
             misspelled.add(nearest)
             of_table = next((f"{k}.{name}" for k, field in fields.items() if name in _keys_of_tables(field.type)), None)
-            probable = nearest or of_table
-            suggestion = suggest_name(name, keys if probable is None else [probable])
+            suggestion = nearest or of_table or _find_nearest(name, keys)
             yield Fault(path, "unknown key", key, choices=keys, suggestion=suggestion)
     for key, field in fields.items():
         if key in data:
             yield from find_faults(data[key], field.type, (*path, key))
         elif field.required and key not in misspelled:
             yield Fault(path, "missing key", key, choices=_choices(field.type))
+
+
+def _find_nearest(value: Any, choices: Iterable[Any]) -> str | None:
+    """Return the choice most similar to a value; None if one of them is no string."""
+    names = [choice for choice in choices if isinstance(choice, str)]
+    return find_nearest_name(value, names) if isinstance(value, str) else None
 
 
 def _keys_of_tables(kind: Any) -> set[str]:
@@ -344,7 +350,7 @@ def _fault_of_value(value: Any, kind: Any, length: int | None, path: tuple[Step,
         return Fault(path, "value", value, _join_or([_type_name(member) for member in _members(kind)]), value_type)
     choices = _choices(kind)
     if choices:
-        return Fault(path, "value", value, choices=choices, suggestion=suggest_name(value, choices))
+        return Fault(path, "value", value, choices=choices, suggestion=_find_nearest(value, choices))
     return Fault(path, "value", value, _join_or(map(_bounded_type_name, same_type)))
 
 

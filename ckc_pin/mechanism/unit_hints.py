@@ -15,7 +15,7 @@ __all__ = ["describe_degrees", "find_unit_warnings", "looks_like_degrees"]
 
 MAX_MACHINE_M = 1000.0  # larger mechanisms are in millimetres whatever their mass
 LARGE_MACHINE_M = 10.0  # a mechanism of this size has more mass than MIN_MASS_PER_METRE
-MIN_MASS_PER_METRE = 10.0  # kg/m: the boom of a crane has more
+MIN_MASS_PER_METRE = 1.0  # kg/m: a light truss has more
 MAX_LENGTH_RATIO = 50.0  # of a length to the median of the others
 MIN_LENGTH_M = 5.0  # shorter lengths are not reported
 MAX_LENGTH_M = 1e5  # larger limits stand for none

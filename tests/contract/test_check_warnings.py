@@ -98,7 +98,7 @@ def test_mass_and_inertia_are_printed_and_in_the_json(bar: Path) -> None:
     assert data["mass"] == pytest.approx(0.2451 + 2 * 0.2611 + 0.2352, rel=1e-14)
     assert np.shape(data["inertia"]) == (3, 3)
     printed = " ".join(ckc("check", "bar").out.split())
-    assert "moving mass 1.0025 kg" in printed
+    assert "size, moving mass 0.3048 m, 1.0025 kg" in printed
     assert "its inertia, kg m² ixx" in printed
     assert f"izz = {data['inertia'][2][2]:.6g} as assembled, about its centre of mass" in printed
 

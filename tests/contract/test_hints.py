@@ -38,6 +38,12 @@ def test_units_of_shipped_mechanisms_cause_no_warning(name: str) -> None:
     assert find_unit_warnings(load(name)) == []
 
 
+def test_long_light_linkage_causes_no_warning(tmp_path: Path) -> None:
+    """A chain of 40 squares of 1 m: 40 m and 81 kg."""
+    scene = load_scene("n_four_bar", {"mechanism.N": 40})
+    assert not any("millimetres" in warning for warning in check(scene).warnings)
+
+
 def test_size_is_printed_and_in_the_json(tmp_path: Path) -> None:
     """The longest distance in this four-bar is from the base's joint gamma to alpha, or along the coupler: 0.5 m."""
     path = str(write(tmp_path))
