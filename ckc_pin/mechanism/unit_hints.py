@@ -18,6 +18,7 @@ LARGE_MACHINE_M = 10.0  # a mechanism of this size has more mass than MIN_MASS_P
 MIN_MASS_PER_METRE = 1.0  # kg/m: a light truss has more
 MAX_LENGTH_RATIO = 50.0  # of a length to the median of the others
 MIN_LENGTH_M = 5.0  # shorter lengths are not reported
+MIN_LIMIT_M = 20.0  # limits of slides below it may stand for none
 MAX_LENGTH_M = 1e5  # larger limits stand for none
 MAX_ANGLE = 2 * math.pi * (1 + 1e-3)  # rad: roll, pitch, yaw and guesses seldom turn further
 MAX_TURNS = 4 * math.pi * (1 + 1e-3)  # rad: limits of joints of several turns are at most two turns each way
@@ -77,7 +78,11 @@ def _find_long(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[st
             continue
         limits = [float(x) for x in (lower[k], upper[k]) if np.isfinite(x)]
         if len(limits) == 2 and not _is_unlimited(*limits) and max(map(abs, limits)) <= MAX_LENGTH_M:
-            yield from (f"limit of {name} = {x:.4g} m" for x in limits if _is_long(abs(x), mechanism.size))
+            yield from (
+                f"limit of {name} = {x:.4g} m"
+                for x in limits
+                if abs(x) >= MIN_LIMIT_M and _is_long(abs(x), mechanism.size)
+            )
         guess = mechanism.spec.q_guess.get(name, 0.0)
         if _is_long(abs(guess), mechanism.size):
             yield f"q_guess.{name} = {guess:.4g} m"

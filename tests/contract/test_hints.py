@@ -108,6 +108,20 @@ def test_angles_in_degrees_are_named(edit: tuple[str, str], says: str, tmp_path:
     assert warning.endswith("; angles are in radians")
 
 
+@pytest.mark.parametrize(("lower", "upper", "is_named"), [(-9, 9, False), (-100, 100, False), (0, 200, True)])
+def test_limits_of_a_slide_in_millimetres_are_named(lower: float, upper: float, is_named: bool, tmp_path: Path) -> None:
+    """A slide on a base of 0.5 m; +-100 m stands for no limits."""
+    slide = f'<axis xyz="0 0 1"/><limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/></joint>'
+    link = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    (tmp_path / "m.urdf").write_text(
+        f'<robot name="m"><link name="base"/><link name="a">{link}</link><joint name="a" type="prismatic">'
+        f'<parent link="base"/><child link="a"/><origin xyz="0.5 0 0"/>{slide}</robot>'
+    )
+    (tmp_path / "mechanism.toml").write_text('name = "m"\nurdf = "m.urdf"\n')
+    expected = ["lengths look like millimetres: limit of a = 200 m; lengths are in metres"] if is_named else []
+    assert find_unit_warnings(load(tmp_path / "mechanism.toml")) == expected
+
+
 @pytest.mark.parametrize("limit", [6.2831853, 12.566370614, 100, 1000, 1e10, 3.0])
 def test_limits_of_whole_turns_and_unlimited_joints_cause_no_warning(limit: float, tmp_path: Path) -> None:
     limits = f'<limit lower="-{limit}" upper="{limit}" effort="1" velocity="1"/>'
