@@ -140,27 +140,6 @@ class PrescribedSpec(MotionSpec, frozen=True, kw_only=True):
     joint
         The joint. It is no longer an independent coordinate.
         ``joint = "crank"``
-    offset : rad, m
-        Constant part of the value.
-        ``offset = -1.4``
-    rate : rad/s, m/s
-        Constant part of the rate, for ever.
-        ``rate = 6.2832``
-    harmonics : rad or m, rad/s, rad
-        Any number of waves, ``[amplitude, frequency, phase]`` each.
-        ``harmonics = [[1.0472, 1.0, 0.0]]``
-    waypoints : s, rad or m
-        ``[t, value]`` each, at least two; the value is held before the first and after the last.
-        ``waypoints = [[0.0, 0.0], [1.0, 0.8], [2.0, 0.5]]``
-    profile
-        Of the motion between waypoints; ``"quintic"`` if absent.
-        ``profile = "trapezoidal"``
-    max_rate : rad/s, m/s
-        Limit of the rate, of ``profile = "trapezoidal"`` only.
-        ``max_rate = 2.0``
-    max_acceleration : rad/s², m/s²
-        Acceleration at the beginning and at the end of each piece, of ``profile = "trapezoidal"`` only.
-        ``max_acceleration = 8.0``
     """
 
     joint: Name
