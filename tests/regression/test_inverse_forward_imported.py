@@ -11,7 +11,7 @@ import pytest
 from ckc_pin import InputError, MechanismError, inverse_dynamics, load, simulate
 from ckc_pin.base.sources import resolve_path
 from ckc_pin.formats.importing import Draft, read, write
-from scripts.experiments.published_robots_motion import given_back
+from scripts.experiments.published_robots_motion import measure_reproduction_error
 from tests.contract.helpers.models import TWO_ARMS, model
 from tests.contract.test_import_urdf import FOUR_BAR, PIN, YAML, imported, legs, spatial, two_legs
 from tests.regression.test_inverse_forward import assert_gives_back, assert_integrates_back, waves
@@ -88,11 +88,11 @@ def test_inverse_dynamics_reproduces_motion_of_package_robots(name: str, tmp_pat
 
 def test_published_robots_are_moved_along_all_driven_freedoms(tmp_path: Path) -> None:
     """They are moved along all freedoms or, with a free root, along those of motors; otherwise an error says so."""
-    assert given_back(MODELS["connects, friction, rotor and gear"](tmp_path)) < 1e-9
+    assert measure_reproduction_error(MODELS["connects, friction, rotor and gear"](tmp_path)) < 1e-9
     pushed = model(tmp_path, FLOATING, "<actuator><motor joint='left'/><motor joint='right'/></actuator>")
-    assert given_back(pushed) < 1e-9
+    assert measure_reproduction_error(pushed) < 1e-9
     with pytest.raises(InputError, match="mass"):
-        given_back(robot("romeo_description/urdf/romeo.urdf"))
+        measure_reproduction_error(robot("romeo_description/urdf/romeo.urdf"))
 
 
 def test_freedom_without_motor_is_named(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from ckc_pin import Run, simulate
 from ckc_pin.dynamics import Terms
 from ckc_pin.native import _core
 from scripts.experiments.stability.cases import GROUPS
-from scripts.experiments.stability.cell import How, run_case
+from scripts.experiments.stability.cell import Variant, run_case
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, tracking
 
 
@@ -61,7 +61,7 @@ def test_auto_detects_stiffness_during_the_run() -> None:
     """A damper becomes effective while a stretched spring still pushes, so modes grow at first."""
     case = next(case for case in GROUPS["spring"]() if case.name == "line 1e+06 N/m, damped")
     longer = {**case.overrides, "t_end": 0.4, "solver.output_dt": 0.1}
-    auto, explicit = run_case(replace(case, overrides=longer, how=(How("dae"), How("dae", "DOP853"))))
+    auto, explicit = run_case(replace(case, overrides=longer, variants=(Variant("dae"), Variant("dae", "DOP853"))))
     assert (auto.method, auto.verdict, explicit.verdict) == ("auto: Radau", "within", "within")
     assert auto.rhs < 0.6 * explicit.rhs
 
