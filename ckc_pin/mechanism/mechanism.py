@@ -7,7 +7,7 @@ from copy import deepcopy
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.errors import InputError, MechanismError
@@ -215,6 +215,8 @@ class Mechanism(HasSummary):
             best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
         if preset is not None:
             names = [name for name in preset if name not in self.prescribed]
+            if self.prescribed and len(names) > self.d:  # each prescribed joint takes one freedom away
+                names = self._prefer(self.tree.indices(tuple(names), "independent"), best)[: self.d]
         else:
             names = self._prefer_driven(best, motors)
         at = self.tree.indices(tuple(names), "independent")
@@ -250,11 +252,15 @@ class Mechanism(HasSummary):
         driven = driven[
             np.argsort(np.argmax(motors.transmission[:, driven] != 0, axis=0), kind="stable")
         ]  # in tau's order
+        return self._prefer(driven, best)
+
+    def _prefer(self, preferred: IntArray, best: list[str]) -> list[str]:
+        """Return independent coordinates: preferred ones as far as phi_z stays well conditioned, then others."""
         blocks = [np.arange(v, v + 6) for _, v in self.tree.free_roots]
-        z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, driven)
+        z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, preferred)
         if z is None:
             return best
-        first = [int(k) for k in driven if k not in z]
+        first = [int(k) for k in preferred if k not in z]
         return [self.coordinates[k] for k in [*first, *(k for k in range(self.n) if k not in {*z, *first})]]
 
     def _choose_motors(self, motors: Motors | None) -> None:
