@@ -28,9 +28,10 @@ from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints
 from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable, start_warnings
+from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import Start
 from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, is_scene_name, load_scene
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, is_scene_name, load_scene, make_scene
 
 __all__ = ["Check", "check"]
 
@@ -242,6 +243,10 @@ def _check_scene(scene: Scene, mechanism: Mechanism) -> Check:
     leaves_workspace = desired is not None and desired.leaves_at is not None
     warnings = [] if start is None else start_warnings(scene, mechanism, start)
     warnings += desired_warnings(mechanism, desired, spec.t_end)
+    if mechanism.prescribed and mechanism.d == 0 and start is not None:  # the motion does not depend on any force
+        run = simulate(make_scene({**scene.to_dict(), "formulation": "reduced"}, scene.name, scene.sources))
+        if run.status == "stopped":
+            warnings.append(f"the prescribed motion cannot be followed beyond t = {run.t[-1]:.5g} s: {run.message}")
     closed_loop = None
     if isinstance(controller, SetPoint | Tracking):
         closed_loop = _check_stability(scene, controller, actuation, start, desired, error_message)

@@ -59,9 +59,13 @@ def describe_stop(
                 f"{_describe_fastest(loop, mechanism)}; {_describe_remaining_work(stop.value)}", t=loop.t
             )
         case StopReason.RANK:
+            reason = (
+                _describe_impossible_motion(mechanism)
+                if mechanism.prescribed
+                else "branches of the motion meet there, and the loops do not determine one"
+            )
             return NumericalError(
-                f"J loses rank at t = {stop.t:.6g} s (smallest singular value {stop.value:.1g}): branches of the "
-                "motion meet there, and the loops do not determine one",
+                f"J loses rank at t = {stop.t:.6g} s (smallest singular value {stop.value:.1g}): {reason}",
                 t=loop.t,
                 q_tree=where,
             )
@@ -151,8 +155,16 @@ def _describe_fastest(loop: Loop, mechanism: Mechanism) -> str:
 
 def describe_singular_phi_z(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:
     """Say that phi_z is singular, so that the independent coordinates do not determine the dependent ones."""
-    names = mechanism.coordinates
-    return (
+    names, prescribed = mechanism.coordinates, mechanism.prescribed
+    known = [*(names[k] for k in q), *(f"the prescribed motion of {name}" for name in prescribed)]
+    dependent = [names[k] for k in z if names[k] not in prescribed]
+    verb = "does" if len(known) == 1 else "do"
+    text = (
         f"phi_z is singular (its smallest singular value is {sigma_min:.2g}): "
-        f"{', '.join(names[k] for k in q)} do not determine {', '.join(names[k] for k in z)} here"
+        f"{', '.join(known)} {verb} not determine {', '.join(dependent)} here"
     )
+    return f"{text}; {_describe_impossible_motion(mechanism)}" if prescribed else text
+
+
+def _describe_impossible_motion(mechanism: Mechanism) -> str:
+    return f"the loops may not allow the prescribed motion of {', '.join(mechanism.prescribed)} from here on"

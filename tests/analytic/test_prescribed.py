@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson, solve_ivp
 
-from ckc_pin import CkcError, InputError, Run, Simulator, load, sensitivities, simulate
+from ckc_pin import CkcError, InputError, Run, Simulator, check, load, sensitivities, simulate
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -148,6 +148,9 @@ def test_motion_that_the_loops_cannot_follow_stops(formulation: str) -> None:
     assert run.status == "stopped"
     assert re.search("singular|loses rank|cannot be kept closed", run.message)
     assert run.t[-1] == pytest.approx(1.0, abs=0.02)
+    assert "the loops may not allow the prescribed motion of slider from here on" in run.message
+    (warning,) = [text for text in check("slider_crank/default", overrides).warnings if "prescribed" in text]
+    assert "cannot be followed beyond t = 1 s" in warning
 
 
 @pytest.mark.parametrize(
