@@ -32,6 +32,7 @@ __all__ = [
     "Tracking",
     "as_controller",
     "is_torque_controller",
+    "require_no_memory",
 ]
 
 
@@ -99,6 +100,34 @@ def as_controller(value: Any) -> Controller | TorqueController:
     controller: Controller | TorqueController = value if methods else FunctionController(value)
     is_torque_controller(controller)  # refuses a controller with both methods
     return controller
+
+
+def require_no_memory(controller: Controller | TorqueController, start: Terms, other: Terms) -> None:
+    """Raise InputError if a controller returns different values for the same (t, terms), as one with memory does.
+
+    An integrator evaluates states in any order, tries steps again and asks for a state several times, so u must be a
+    function of (t, terms) alone. The controller is called at the start, at another state, and at the start again.
+
+    Parameters
+    ----------
+    controller : Controller or TorqueController
+    start, other : Terms
+        At t = 0, and at another state later.
+    """
+    method = "tau" if is_torque_controller(controller) else "u"
+    law: Callable[[float, Terms], Any] = getattr(controller, method)
+    try:
+        first, _, again = law(start.t, start), law(other.t, other), law(start.t, start)
+        differs = not np.array_equal(np.asarray(first, dtype=float), np.asarray(again, dtype=float), equal_nan=True)
+    except Exception:  # The run calls it again and reports what is wrong with it.
+        return
+    if differs:
+        raise InputError(
+            f"controller: {method} returns {describe_value(again)} at t = 0 after a call at t = {other.t:g}, and "
+            f"{describe_value(first)} before it. It must be a function of (t, terms) alone, because the integrator "
+            "calls it in any order; a controller with memory or noise runs as "
+            "ckc_pin.Sampled(controller, sample_time), which calls it once a sample"
+        )
 
 
 def _require_lyapunov(function: Any) -> None:

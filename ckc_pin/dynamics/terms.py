@@ -39,14 +39,17 @@ class Terms(HasSummary):
         The constraint terms at q'.
     v_tree : (n,) array
         Velocity v' in tangent coordinates, at which C', rho_dot and the bias are evaluated.
+    t : float
+        Time of the state, s.
 
     Notes
     -----
     Units are SI. Results are copies, since Pinocchio's workspace is shared (`Tree.evaluate`).
     """
 
-    def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array) -> None:
+    def __init__(self, mechanism: Mechanism, at: Kinematics, v_tree: Array, t: float = 0.0) -> None:
         self.mechanism = mechanism
+        self.t = t
         self.at = at
         self.q_tree = at.q_tree
         self.v_tree = v_tree

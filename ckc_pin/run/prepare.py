@@ -14,8 +14,18 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController, as_controller
+from ckc_pin.control.controllers import (
+    ControlLaw,
+    Controller,
+    RecordedTorques,
+    SetPoint,
+    TorqueController,
+    Tracking,
+    as_controller,
+    require_no_memory,
+)
 from ckc_pin.control.sampled import Sampled
+from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
@@ -46,6 +56,11 @@ MAX_INERTIA_RATIO = 1e4
 # A collocation step keeps the loops closed to this, relative to the mechanism's size. Otherwise its branches would not
 # meet at a loss of rank.
 COLLOCATION_TOLERANCE = 1e-9
+# A controller is called at the start, later and at another state, and at the start again, to see whether it changes.
+MEMORY_CHECK_TIME = 1e-3  # of t_end
+MEMORY_CHECK_STEP = 1e-3  # of each independent coordinate: rad, or relative to the mechanism's size
+# Controllers that are functions of (t, terms), or are evaluated once a sample.
+NATIVE_CONTROLLERS = (SetPoint, Tracking, RecordedTorques, Sampled)
 
 
 @dataclass(frozen=True)
@@ -128,6 +143,8 @@ class Prepared:
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Set the loop to a start at time t (s), by default the scene's, and discard its history.
 
+        A controller with a method `reset` is reset, so that it carries nothing over from an earlier run.
+
         Raises
         ------
         InputError
@@ -143,6 +160,10 @@ class Prepared:
             raise InputError(
                 f"initial.q_dot = {start.q_dot.tolist()}: the rates of the dependent coordinates are not finite"
             )
+        law = self.controller.controller if isinstance(self.controller, Sampled) else self.controller
+        reset = getattr(law, "reset", None)
+        if callable(reset):
+            reset()
         self.loop.start(t, start.at.q_tree, v_tree, start.w)
 
 
@@ -192,6 +213,12 @@ def prepare(
     actuation = build_scene_actuation(scene, mechanism)
     functions = build_event_functions(scene.spec.event, events, mechanism)
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
+    if controller is not None and not isinstance(controller, NATIVE_CONTROLLERS):
+        v_tree, tree = start.at.rho @ start.q_dot, mechanism.tree
+        step = MEMORY_CHECK_STEP * start.at.rho.sum(axis=1) * tree.step_scale
+        other = mechanism.kinematics(tree.integrate(start.at.q_tree, step))
+        later = MEMORY_CHECK_TIME * scene.spec.t_end
+        require_no_memory(controller, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
     if mechanism.prescribed:
