@@ -155,8 +155,8 @@ def _close_near(linkage: Linkage, start: Array, bounds: tuple[Array, Array] | No
     tree, exact, rounded = linkage.tree, EXACT_TOLERANCE * linkage.size, ROUNDED_TOLERANCE * linkage.size
     if linkage.spec.independent is not None:
         free = np.ones(tree.n)
-        held = [name for name in linkage.spec.independent if name not in linkage.prescribed]
-        free[tree.indices(tuple(held), "independent")] = 0.0
+        fixed = [name for name in linkage.spec.independent if name not in linkage.prescribed]
+        free[tree.indices(tuple(fixed), "independent")] = 0.0
         closed = close_loops(tree, linkage.closure, start, free, exact, bounds=bounds, rounded=rounded)
     if closed is None or closed.residual > rounded:
         closed = close_loops(tree, linkage.closure, start, np.ones(tree.n), exact, bounds=bounds, rounded=rounded)

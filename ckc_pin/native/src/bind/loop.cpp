@@ -95,6 +95,9 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
       get<std::string>(solver, "method"),       get<double>(solver, "rtol"),     get<double>(solver, "atol"),
       get<double>(solver, "max_step"),          get<double>(solver, "min_step"), get<long>(solver, "max_rhs"),
       get<double>(solver, "manifold_tolerance")};
+  const bool is_known = options.method == "auto" || std::find(std::begin(method_names), std::end(method_names),
+                                                              options.method) != std::end(method_names);
+  require(is_known, "method: " + options.method + " is unknown");
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0,
           "rtol, atol and max_step: positive numbers are needed");
   std::vector<Event> functions;
