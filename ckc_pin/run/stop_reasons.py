@@ -156,12 +156,12 @@ def _describe_fastest(loop: Loop, mechanism: Mechanism) -> str:
 def describe_singular_phi_z(mechanism: Mechanism, sigma_min: float, q: list[int], z: list[int]) -> str:
     """Say that phi_z is singular, so that the independent coordinates do not determine the dependent ones."""
     names, prescribed = mechanism.coordinates, mechanism.prescribed
-    known = [*(names[k] for k in q), *(f"the prescribed motion of {name}" for name in prescribed)]
+    determining = [*(names[k] for k in q), *(f"the prescribed motion of {name}" for name in prescribed)]
     dependent = [names[k] for k in z if names[k] not in prescribed]
-    verb = "does" if len(known) == 1 else "do"
+    verb = "does" if len(determining) == 1 else "do"
     text = (
         f"phi_z is singular (its smallest singular value is {sigma_min:.2g}): "
-        f"{', '.join(known)} {verb} not determine {', '.join(dependent)} here"
+        f"{', '.join(determining)} {verb} not determine {', '.join(dependent)} here"
     )
     return f"{text}; {_describe_impossible_motion(mechanism)}" if prescribed else text
 
