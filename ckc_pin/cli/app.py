@@ -38,7 +38,7 @@ COMPLETE_VARIABLE = "_CKC_COMPLETE"
 COMMANDS = {
     "new": "files:new",
     "list": "inspection:list_",
-    "keys": "keys:keys",
+    "keys": "inspection:keys",
     "check": "inspection:check",
     "terms": "inspection:terms",
     "compile": "inspection:compile_",

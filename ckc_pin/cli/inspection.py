@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ckc_pin.base.arrays import Array
     from ckc_pin.dynamics.terms import Terms
 
-__all__ = ["check", "compile_", "list_", "terms"]
+__all__ = ["check", "compile_", "keys", "list_", "terms"]
 
 
 @click.command("list", epilog=options.format_examples("ckc list"))
@@ -150,3 +150,28 @@ def _announce_compilation(seconds: float) -> None:
     """Print the expected duration of a long compilation before it starts."""
     if seconds > LONG_S:
         error_console().print(f"the compiler may take {seconds:.0f} s")
+
+
+@click.command(
+    epilog=options.format_examples("ckc keys motor", "ckc keys scene.solver", "ckc keys set_point", "ckc keys | less")
+)
+@click.argument(
+    "table",
+    metavar="[TABLE]",
+    required=False,
+    help="A table, as motor, solver, controller.desired or tracking; or all tables of a file: mechanism, scene, sweep.",
+)
+@options.as_json
+def keys(table: str | None, as_json: bool) -> None:
+    """Print the keys of mechanism, scene and sweep files.
+
+    A line for each key says its type, its unit, its default and its meaning.
+    """
+    from ckc_pin.cli.key_tables import FILES, find_tables, format_tables, tables
+
+    selected = [(file, each) for file in FILES for each in tables(file)] if table is None else find_tables(table)
+    if as_json:
+        print_json({"tables": [each.to_dict() | {"file": file} for file, each in selected]})
+        return
+    for line in format_tables(selected):
+        print(line)

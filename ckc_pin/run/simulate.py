@@ -23,8 +23,7 @@ from ckc_pin.run.loop_terms import require_number
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
-from ckc_pin.run.stop_reasons import PAUSE_S, describe_stop
-from ckc_pin.run.warnings import add_cause, find_exit, known_warnings
+from ckc_pin.run.stop_reasons import PAUSE_S, add_cause, describe_stop, find_exit, known_warnings
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
