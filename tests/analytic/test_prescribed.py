@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import simpson, solve_ivp
+from scipy.optimize import brentq
 
 from ckc_pin import CkcError, InputError, Run, Simulator, check, load, sensitivities, simulate
 from ckc_pin.control.desired import Harmonics
@@ -101,6 +102,27 @@ def test_steps_agree_with_the_run(formulation: str) -> None:
         assert_close(state.q_tree, run.q_tree[k], 1e-8)
     simulator.reset(state)
     assert_close(simulator.state.v_tree, state.v_tree, 1e-9)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_events_of_a_prescribed_joint_are_at_their_exact_times(formulation: str) -> None:
+    events = [{"coordinate": "theta_1", "value": -1.2}, {"coordinate": "theta_1", "of": "q_dot", "value": 0.0}]
+    run = simulate("five_bar/swing", scene(formulation, t_end=0.3, event=events))
+    expected = [brentq(lambda t: left_crank(t)[0] + 1.2, 0.0, 0.1), brentq(lambda t: left_crank(t)[1], 0.1, 0.3)]
+    assert_close(np.array([event["t"] for event in run.events]), np.array(expected), 1e-9)
+
+
+def test_dry_friction_beside_a_prescribed_joint_agrees_between_formulations() -> None:
+    friction = {"joint.theta_3.friction": 0.05, "joint.theta_1.friction": 0.1}
+    runs = [simulate("five_bar/swing", scene(formulation, parameters=friction)) for formulation in FORMULATIONS]
+    without = simulate("five_bar/swing", scene("dae", parameters={"joint.theta_3.friction": 0.05}))
+    for run in runs:
+        assert [event["name"] for event in run.events] == ["theta_3 slides"] * 4
+        assert_close(np.array([x["t"] for x in run.events]), np.array([x["t"] for x in runs[0].events]), 1e-8)
+        assert_close(run.q_tree, runs[0].q_tree, 1e-8)
+    crank = runs[0].actuated.index("theta_1")
+    rate = runs[0].v_tree[:, 0]
+    assert_close(runs[0].tau[:, crank] - without.tau[:, crank], 0.1 * np.sign(rate), 1e-7)
 
 
 # --- slider-crank, without any freedom -----------------------------------------------------------
