@@ -18,6 +18,7 @@ __all__ = [
     "MIN_SIMILARITY",
     "accepts_arguments",
     "describe_value",
+    "find_near_names",
     "find_nearest_name",
     "is_number",
     "require_callable",
@@ -143,14 +144,23 @@ def find_nearest_name(name: str, names: Iterable[str], min_similarity: float = 0
     min_similarity : float
         Between 0 and 1. The result is None if no name is so similar.
     """
+    similarities = {other: _similarity(name, other) for other in names}
+    best = max(similarities, key=similarities.__getitem__, default=None)
+    return best if best is not None and similarities[best] >= min_similarity else None
+
+
+def find_near_names(name: Any, names: Iterable[str], count: int) -> list[str]:
+    """Return the valid names that are most similar to an unknown one, the most similar first."""
+    from heapq import nlargest  # imported here because input without errors does not need it
+
+    return nlargest(count, names, key=lambda other: _similarity(str(name), other))
+
+
+def _similarity(name: str, other: str) -> float:
     from difflib import SequenceMatcher  # imported here because input without errors does not need it
 
-    def similarity(other: str) -> float:
-        pairs = ((name, other), (_fold_case(name), _fold_case(other)))
-        return max(SequenceMatcher(None, *pair).ratio() for pair in pairs)
-
-    best = max(names, key=similarity, default=None)
-    return best if best is not None and similarity(best) >= min_similarity else None
+    pairs = ((name, other), (_fold_case(name), _fold_case(other)))
+    return max(SequenceMatcher(None, *pair).ratio() for pair in pairs)
 
 
 def suggest_name(name: Any, names: Iterable[Any]) -> str:

@@ -1,86 +1,210 @@
-"""Named columns of a run (data frame, CSV, xarray), and units of its quantities, of parameters and of scene keys."""
+"""Names of the quantities of results, tables of them (data frame, CSV, xarray), and units of quantities and keys."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
+from ckc_pin.base.validation import describe_value, find_near_names
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.units import STIFF, VISCOUS, effort, joined, motor_units, parameter_unit, row_units
+from ckc_pin.run.run_file import ARRAYS
 
 if TYPE_CHECKING:
     from ckc_pin.run.run import Run
 
 __all__ = [
+    "Quantity",
     "derivative_unit",
+    "evaluate_quantity",
     "integral_unit",
     "key_unit",
     "list_columns",
+    "list_quantities",
     "quantity_units",
     "to_csv_text",
     "to_data_frame",
     "to_dataset",
+    "unknown_quantity",
 ]
 
-SCALARS = ("energy", "lyapunov", "dissipated")  # quantities of a run with one value per instant, J
-AXES = ["x", "y", "z"]
+AXES = ("x", "y", "z")
+WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
+WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
+SCALARS = ("energy", "lyapunov", "dissipated")  # recorded quantities of a run with one value per instant, J
+DESIRED = ("desired", "desired_dot", "error")  # arrays that only runs with a desired motion have
+TABLE_ARRAYS = ("q_tree", "v_tree", "u", "tau", *DESIRED, "point_positions", "point_velocities", "phi", "w", "energy")
+NEAR_NAMES = 4  # that a message about an unknown name lists
 KEYS_IN_SECONDS = ("t_end", "epsilon", "max_step", "min_step", "max_wall_s", "output_dt", "sample_time", "delay",
                    "filter")  # fmt: skip
 
 
-# --- columns ---------------------------------------------------------------------------------------
+# --- names -----------------------------------------------------------------------------------------
 
 
-def list_columns(run: Run) -> dict[str, Array]:
-    """Return the columns of a run's table except t, by name: coordinates, ``v.``, ``u.``, ``tau.``, ``phi.``, ``w.``.
+class Quantity(NamedTuple):
+    """A named scalar quantity of a result: a column of one of its arrays.
 
-    Energies and the world coordinates of points follow.
+    Attributes
+    ----------
+    array : str
+        Name of the array with a row for each instant: an attribute of `Run`, or of `ckc_pin.run.derived.RunQuantities`.
+    column : int or None
+        None if the array has one value for each instant.
+    unit : str
+    """
+
+    array: str
+    column: int | None
+    unit: str
+
+    def select(self, values: Array) -> Array:
+        """Return the quantity from its array."""
+        return values if self.column is None else values[:, self.column]
+
+
+def iterate_quantities(mechanism: Mechanism) -> Iterator[tuple[str, Quantity]]:
+    """Yield the names of all quantities of a mechanism's results (docs/reference/names.md), with their meaning."""
+    tree, motors = mechanism.tree, mechanism.motors.names
+    by_quantity = quantity_units(mechanism)
+    q_units, row_names = by_quantity["error"], [".".join(name) for name in mechanism.closure.names]
+    rates = [f"{unit}/s" for unit in q_units]
+    yield from _name_columns("", mechanism.coordinates, "q_tree", by_quantity["q_tree"])
+    yield from _name_columns("v.", mechanism.coordinates, "v_tree", by_quantity["v_tree"])
+    yield from _name_columns("a.", mechanism.coordinates, "a_tree", tree.units("/s²"))
+    yield from _name_columns("u.", mechanism.independent, "u", by_quantity["u"])
+    yield from _name_columns("tau.", motors, "tau", by_quantity["tau"])
+    yield from _name_columns("desired.", mechanism.independent, "desired", q_units)
+    yield from _name_columns("desired.v.", mechanism.independent, "desired_dot", rates)
+    yield from _name_columns("error.", mechanism.independent, "error", q_units)
+    for infix, array, unit in (("", "point_positions", "m"), ("v.", "point_velocities", "m/s")):
+        names = [f"{point}.{infix}{axis}" for point in mechanism.points for axis in AXES]
+        yield from _name_columns("", names, array, [unit] * len(names))
+    yield from _name_columns("loop.", row_names, "multipliers", [effort(unit) for unit in by_quantity["phi"]])
+    joints = [name for name, joint in list(zip(tree.model.names, tree.model.joints, strict=True))[1:] if joint.nv == 1]
+    wrenches = [f"{joint}.{component}" for joint in joints for component in WRENCH]
+    yield from _name_columns("joint.", wrenches, "joint_wrenches", WRENCH_UNITS * len(joints))
+    yield "energy.kinetic", Quantity("kinetic_energy", None, "J")
+    yield "energy.potential", Quantity("potential_energy", None, "J")
+    yield "energy.total", Quantity("energy", None, "J")
+    yield from _name_columns("phi.", row_names, "phi", by_quantity["phi"])
+    yield from _name_columns("w.", row_names, "w", by_quantity["w"])
+    yield "phi.max", Quantity("phi_max", None, joined(by_quantity["phi"]))
+    yield "sigma_min", Quantity("sigma_min", None, "")
+
+
+def list_quantities(mechanism: Mechanism) -> dict[str, Quantity]:
+    """Return the quantities of a mechanism's results by name. If two have the same name, the first one keeps it."""
+    quantities: dict[str, Quantity] = {}
+    for name, quantity in iterate_quantities(mechanism):
+        quantities.setdefault(name, quantity)
+    return quantities
+
+
+def unknown_quantity(where: str, name: Any, mechanism: Mechanism, arrays: Sequence[str] = ()) -> InputError:
+    """Return the error for a name that no quantity has. It lists the nearest names, coordinates and arrays."""
+    near = find_near_names(name, [*list_quantities(mechanism), *arrays], NEAR_NAMES)
+    listed = ", ".join(mechanism.coordinates) + (f", and the arrays {', '.join(arrays)}" if arrays else "")
+    return InputError(
+        f"{where}: no such quantity; the nearest names are {', '.join(map(repr, near))}; "
+        f"there are the coordinates {listed}; docs/reference/names.md has all names"
+    )
+
+
+def _name_columns(
+    prefix: str, names: Sequence[str], array: str, units: Sequence[str]
+) -> Iterator[tuple[str, Quantity]]:
+    for column, (name, unit) in enumerate(zip(names, units, strict=True)):
+        yield prefix + name, Quantity(array, column, unit)
+
+
+def evaluate_quantity(run: Run, name: str, quantity: Quantity) -> Array:
+    """Return a quantity along a run, shape (m,). Only its array is computed.
 
     Raises
     ------
     InputError
-        Two columns would have the same name.
+        The run does not determine it.
     """
-    rows = _row_names(run)
-    columns: list[tuple[str, Array]] = [
-        *_name_columns("", run.coordinates, run.q_tree),
-        *_name_columns("v.", run.coordinates, run.v_tree),
-        *_name_columns("u.", run.independent, run.u),
-        *_name_columns("tau.", run.actuated, run.tau),
-        *_name_columns("phi.", rows, run.phi),
-        *_name_columns("w.", rows, run.w),
-        *((name, getattr(run, name)) for name in SCALARS if getattr(run, name) is not None),
+    recorded = quantity.array in (*ARRAYS, "desired", "error")
+    values = getattr(run if recorded else run.derived, quantity.array)
+    if values is None:
+        raise InputError(f"run[{name!r}]: the run has no desired motion")
+    return quantity.select(values)
+
+
+# --- tables ----------------------------------------------------------------------------------------
+
+
+def list_columns(run: Run, names: Sequence[str] | None = None, where: str = "Run.to_csv") -> dict[str, Array]:
+    """Return the columns of a run's table except t, by name.
+
+    Parameters
+    ----------
+    run : Run
+    names : sequence of str, optional
+        Any names that ``run[name]`` takes. Default: what is recorded, the desired motion with its errors, and points.
+    where : str
+        Named in errors.
+
+    Raises
+    ------
+    InputError
+        Unknown name, or two columns would have the same name.
+    """
+    if names is not None:
+        return {name: _select_named(run, name, f"{where}: columns") for name in _require_names(names, where)}
+    has_desired = run.desired is not None
+    arrays = [name for name in TABLE_ARRAYS if has_desired or name not in DESIRED]
+    columns = [
+        (name, evaluate_quantity(run, name, quantity))
+        for array in arrays
+        for name, quantity in iterate_quantities(run.mechanism)
+        if quantity.array == array
     ]
-    for point, path in run.points.items():
-        columns += _name_columns(f"{point}.", AXES, path)
+    columns += [(name, getattr(run, name)) for name in SCALARS if getattr(run, name) is not None]
     by_name = dict(columns)
     if len(by_name) < len(columns) or "t" in by_name:
-        names = [name for name, _ in columns]
-        duplicate = next((name for name in names if names.count(name) > 1), "t")
+        all_names = [name for name, _ in columns]
+        duplicate = next((name for name in all_names if all_names.count(name) > 1), "t")
         raise InputError(f"{run.scene_name}: two columns would be called {duplicate!r}; rename that joint")
     return by_name
 
 
-def to_csv_text(run: Run) -> str:
-    """Return a run as CSV with the columns t and those of `list_columns`. All digits of each number are written."""
+def _require_names(names: Any, where: str) -> list[str]:
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f'{where}: columns: expected a list of names, as ["theta_1", "tip.x"], got {describe_value(names)}'
+        )
+    return list(names)
+
+
+def _select_named(run: Run, name: str, where: str) -> Array:
+    values = run[name]
+    if values.ndim != 1:
+        raise InputError(f"{where}: {name!r} is an array of several columns; name each of them")
+    return values
+
+
+def to_csv_text(t: Array, columns: Mapping[str, Array]) -> str:
+    """Return a table as CSV with the columns t and `columns`. All digits of each number are written."""
     import csv
 
-    columns = list_columns(run)
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["t", *columns])
-    writer.writerows(np.column_stack([run.t, *columns.values()]).tolist())
+    writer.writerows(np.column_stack([t, *columns.values()]).tolist())
     return text.getvalue()
 
 
-def to_data_frame(run: Run) -> Any:
-    """Return a run as a pandas DataFrame with the index t.
+def to_data_frame(t: Array, columns: Mapping[str, Array]) -> Any:
+    """Return a table as a pandas DataFrame with the index t.
 
     Raises
     ------
@@ -91,7 +215,7 @@ def to_data_frame(run: Run) -> Any:
         import pandas
     except ModuleNotFoundError:
         raise InputError("to_pandas needs pandas: pip install 'ckc_pin[data]'") from None
-    return pandas.DataFrame(list_columns(run), index=pandas.Index(run.t, name="t"))
+    return pandas.DataFrame(dict(columns), index=pandas.Index(t, name="t"))
 
 
 def to_dataset(run: Run) -> Any:
@@ -120,12 +244,17 @@ def to_dataset(run: Run) -> Any:
         for name, (dimension, values) in vectors.items()
     }
     data |= {name: ("t", getattr(run, name), {"units": "J"}) for name in SCALARS if getattr(run, name) is not None}
+    if run.desired_path is not None:
+        q_unit, rate_unit = joined(units["error"]), joined(f"{unit}/s" for unit in units["error"])
+        data["desired"] = (("t", "independent"), run.desired, {"units": q_unit})
+        data["desired.v"] = (("t", "independent"), run.desired_path.q_dot, {"units": rate_unit})
+        data["error"] = (("t", "independent"), run.error, {"units": q_unit})
     coordinates: dict[str, Any] = {
         "t": ("t", run.t, {"units": "s"}),
         "coordinate": list(run.coordinates),
         "independent": list(run.independent),
         "motor": list(run.actuated),
-        "row": _row_names(run),
+        "row": [".".join(name) for name in run.mechanism.closure.names],
         "unit": ("coordinate", units["q_tree"]),
         "independent_unit": ("independent", units["error"]),
         "motor_unit": ("motor", units["tau"]),
@@ -133,17 +262,11 @@ def to_dataset(run: Run) -> Any:
     }
     if run.points:
         data["points"] = (("point", "t", "axis"), np.array(list(run.points.values())), {"units": "m"})
-        coordinates |= {"point": list(run.points), "axis": AXES}
+        velocities = run.derived.point_velocities.reshape(len(run.t), -1, 3)
+        data["points.v"] = (("point", "t", "axis"), velocities.transpose(1, 0, 2), {"units": "m/s"})
+        coordinates |= {"point": list(run.points), "axis": list(AXES)}
     attributes = {"scene": run.scene_name, "formulation": run.scene["formulation"], "status": run.status}
     return xarray.Dataset(data, coordinates, {**attributes, "message": run.message})
-
-
-def _row_names(run: Run) -> list[str]:
-    return [".".join(name) for name in run.mechanism.closure.names]
-
-
-def _name_columns(prefix: str, names: Sequence[str], values: Array) -> list[tuple[str, Array]]:
-    return [(f"{prefix}{name}", values[:, k]) for k, name in enumerate(names)]
 
 
 # --- units -----------------------------------------------------------------------------------------

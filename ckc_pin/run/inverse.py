@@ -8,6 +8,7 @@ joints slid, stuck and touched stops.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from os.path import isfile
 from pathlib import Path
@@ -36,7 +37,7 @@ from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, as_scene, make_scene
 
-__all__ = ["RecordedJoints", "compute_loop_forces", "inverse_dynamics"]
+__all__ = ["RecordedJoints", "compute_loop_forces", "compute_recorded_dynamics", "inverse_dynamics"]
 
 # Below this, relative to the forces along a freedom, a missing generalized force is rounding.
 FORCE_TOLERANCE = 1e-7
@@ -328,17 +329,44 @@ class RecordedJoints:
 
 def compute_loop_forces(run: Run) -> dict[str, Array]:
     """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
+    _, forces = compute_recorded_dynamics(run, "loop_forces")
+    loops = [loop for loop, _ in run.mechanism.closure.names]
+    return {loop: forces[:, [name == loop for name in loops]] for loop in dict.fromkeys(loops)}
+
+
+def compute_recorded_dynamics(run: Run, function: str) -> tuple[Array, Array]:
+    """Return the accelerations of the tree and the multipliers of eq. 1 at a run's output instants.
+
+    They follow from the recorded state and motor torques, and from the friction and stops of the run's events.
+
+    Parameters
+    ----------
+    run : Run
+    function : str
+        Named in the error.
+
+    Returns
+    -------
+    a_tree : (m, n) array
+        Time derivative of v'.
+    multipliers : (m, rows) array
+        Both are NaN where J has lost rank.
+
+    Raises
+    ------
+    InputError
+        The mechanism has prescribed joints.
+    """
     mechanism, recorded_joints = run.mechanism, RecordedJoints(run)
-    mechanism.refuse_prescribed_joints("loop_forces")
-    forces = np.empty_like(run.phi)
+    mechanism.refuse_prescribed_joints(function)
+    accelerations, forces = np.full_like(run.v_tree, np.nan), np.full_like(run.phi, np.nan)
     for k, numbers in enumerate(run.q_tree):
         at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
         terms = Terms(mechanism, at, run.v_tree[k])
         u_tree = mechanism.motors.force(run.tau[k])
-        try:
+        with suppress(NumericalError):
             u_tree += recorded_joints.force(k, terms, u_tree)
-            forces[k] = multipliers(terms, u_tree, dae_acceleration(terms, u_tree))
-        except NumericalError:
-            forces[k] = np.nan
-    loops = [loop for loop, _ in mechanism.closure.names]
-    return {loop: forces[:, [name == loop for name in loops]] for loop in dict.fromkeys(loops)}
+            acceleration = dae_acceleration(terms, u_tree)
+            forces[k] = multipliers(terms, u_tree, acceleration)
+            accelerations[k] = acceleration
+    return accelerations, forces

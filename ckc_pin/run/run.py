@@ -18,13 +18,26 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import describe_value, is_number, require_path
 from ckc_pin.codegen.library import explain_too_large
+from ckc_pin.control.desired import Desired
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import plain_values
 from ckc_pin.mechanism.units import joined
-from ckc_pin.run.columns import quantity_units, to_csv_text, to_data_frame, to_dataset
+from ckc_pin.run.columns import (
+    Quantity,
+    evaluate_quantity,
+    list_columns,
+    list_quantities,
+    quantity_units,
+    to_csv_text,
+    to_data_frame,
+    to_dataset,
+    unknown_quantity,
+)
+from ckc_pin.run.derived import RunQuantities
+from ckc_pin.run.desired_path import DesiredPath, compute_desired_path, sample_target
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
 from ckc_pin.run.state import State, recorded_state
 from ckc_pin.scene.parts import prescribed_positions
@@ -51,8 +64,9 @@ LONG_RUN_S = 10.0  # compiling the terms of a mechanism usually takes less, s
 class Run(HasSummary):
     """Results of a simulation. Arrays have a row for each output instant.
 
-    ``run["theta_1"]`` is a coordinate along the motion and ``run.sel(t=0.5)`` the state at an instant. ``run.plot()``
-    draws figures and ``run.play()`` plays the motion. `to_xarray`, `to_pandas` and `to_csv` export it.
+    ``run["theta_1"]`` is a coordinate along the motion, ``run["tau.theta_1"]`` a motor torque, ``run["tip.v.x"]`` the
+    velocity of a point; docs/reference/names.md lists the names. ``run.sel(t=0.5)`` is the state at an instant.
+    ``run.plot()`` draws figures and ``run.play()`` plays the motion. `to_xarray`, `to_pandas` and `to_csv` export it.
 
     Attributes
     ----------
@@ -123,9 +137,11 @@ class Run(HasSummary):
     built_mechanism: InitVar[Mechanism | None] = (
         None  # the simulated mechanism, so that `mechanism` need not rebuild it
     )
+    built_target: InitVar[Desired | Array | None] = None  # desired motion of a controller that was given in Python
 
-    def __post_init__(self, built_mechanism: Mechanism | None) -> None:
+    def __post_init__(self, built_mechanism: Mechanism | None, built_target: Desired | Array | None) -> None:
         object.__setattr__(self, "_built_mechanism", built_mechanism)
+        object.__setattr__(self, "_built_target", built_target)
 
     @cached_property
     def mechanism(self) -> Mechanism:
@@ -214,22 +230,78 @@ class Run(HasSummary):
     # --- access by name and by time --------------------------------------------------------------
 
     def __getitem__(self, name: str) -> Array:
-        """Return a coordinate along the run, shape (m,), or an array by its name, as ``run["energy"]``.
+        """Return a quantity along the run by its name, shape (m,), or an array, as ``run["q_tree"]``.
+
+        Quantities that are not recorded are computed at their first use.
+
+        Parameters
+        ----------
+        name : str
+            ``theta_1``, ``v.theta_1``, ``a.theta_1``, ``u.theta_1``, ``tau.MOTOR``, ``desired.theta_1``,
+            ``desired.v.theta_1``, ``error.theta_1``, ``tip.x``, ``tip.v.x``, ``loop.LOOP.ROW``, ``joint.JOINT.fx``,
+            ``energy.kinetic``, ``energy.potential``, ``energy.total``, ``phi.LOOP.ROW``, ``phi.max``, ``sigma_min``.
 
         Raises
         ------
         InputError
-            There is no such coordinate or array; the message lists the existing ones.
+            There is no such quantity; the message lists the existing ones and the nearest one. Or this run does not
+            determine it.
         """
         if name in self.coordinates:
             return self.q_tree[:, self.coordinates.index(name)]
         arrays = [array for array in (*ARRAYS, *OPTIONAL) if getattr(self, array) is not None]
-        if name not in arrays:
-            raise InputError(
-                f"run[{describe_value(name)}]: no such coordinate or array; there are the coordinates "
-                f"{', '.join(self.coordinates)}, and the arrays {', '.join(arrays)}"
-            )
-        return np.asarray(getattr(self, name))
+        if name in arrays:
+            return np.asarray(getattr(self, name))
+        quantity = self.quantities.get(str(name))
+        if quantity is None:
+            raise unknown_quantity(f"run[{describe_value(name)}]", name, self.mechanism, arrays)
+        return evaluate_quantity(self, name, quantity)
+
+    @cached_property
+    def quantities(self) -> dict[str, Quantity]:
+        """The names that ``run[name]`` takes for scalar quantities, with array, column and unit of each."""
+        return list_quantities(self.mechanism)
+
+    @cached_property
+    def derived(self) -> RunQuantities:
+        """Arrays that are not recorded, such as point velocities and accelerations; each is computed at first use."""
+        return RunQuantities(self)
+
+    @property
+    def q(self) -> Array:
+        """Independent coordinates, shape (m, d), in the order of `independent`."""
+        return self.q_tree[:, self._independent_columns]
+
+    @property
+    def q_dot(self) -> Array:
+        """Rates of the independent coordinates, shape (m, d). A free root has them in its own axes."""
+        return self.v_tree[:, self._independent_columns]
+
+    @property
+    def _independent_columns(self) -> list[int]:
+        return [self.coordinates.index(name) for name in self.independent]
+
+    @cached_property
+    def desired_path(self) -> DesiredPath | None:
+        """Desired independent coordinates and their rates along the run; None without a desired motion.
+
+        They follow from the scene. The desired motion of a `Tracking` or `SetPoint` that was given in Python is known
+        until the run is saved.
+        """
+        target: Desired | Array | None = self._built_target  # type: ignore[attr-defined]
+        if "controller" in self.scene or target is None:
+            return compute_desired_path(self)
+        return sample_target(target, self.t, len(self.independent))
+
+    @property
+    def desired(self) -> Array | None:
+        """Desired independent coordinates q_d, shape (m, d); None without a desired motion."""
+        return None if self.desired_path is None else self.desired_path.q
+
+    @property
+    def error(self) -> Array | None:
+        """Errors q - q_d of the independent coordinates, shape (m, d); None without a desired motion."""
+        return None if self.desired is None else self.q - self.desired
 
     @overload
     def sel(self, *, t: float) -> State: ...
@@ -279,7 +351,7 @@ class Run(HasSummary):
             )
         arrays = {name: getattr(self, name) for name in (*ARRAYS, *OPTIONAL)}
         selected: dict[str, Any] = {name: x if x is None else x[rows] for name, x in arrays.items()}
-        return replace(self, events=[event for event in self.events if start <= event["t"] <= stop], **selected)
+        return self._replace(events=[event for event in self.events if start <= event["t"] <= stop], **selected)
 
     def column(self, coordinate: str) -> int:
         """Return the column of a coordinate.
@@ -302,12 +374,8 @@ class Run(HasSummary):
     @cached_property
     def points(self) -> dict[str, Array]:
         """World positions of the mechanism's points along the run, {name: (m, 3) array}."""
-        mechanism = self.mechanism
-        paths = {name: np.empty((len(self.t), 3)) for name in mechanism.points}
-        for k, numbers in enumerate(self.q_tree):
-            for name, p in mechanism.point_positions(mechanism.tree.from_coordinates(numbers)).items():
-                paths[name][k] = p
-        return paths
+        positions = self.derived.point_positions
+        return {name: positions[:, 3 * k : 3 * k + 3] for k, name in enumerate(self.mechanism.points)}
 
     @cached_property
     def motor_rates(self) -> Array:
@@ -334,8 +402,12 @@ class Run(HasSummary):
     def with_warnings(self, warnings: Sequence[str]) -> Run:
         """Return the run with further warnings, each of them once."""
         merged = tuple(dict.fromkeys((*self.warnings, *warnings)))
-        simulated: Mechanism | None = self._built_mechanism  # type: ignore[attr-defined]
-        return self if merged == self.warnings else replace(self, warnings=merged, built_mechanism=simulated)
+        return self if merged == self.warnings else self._replace(warnings=merged)
+
+    def _replace(self, **changes: Any) -> Run:
+        """Return the run with other attributes, and with what it keeps of the simulation."""
+        built: dict[str, Any] = {name: getattr(self, f"_{name}") for name in ("built_mechanism", "built_target")}
+        return replace(self, **built, **changes)
 
     def loop_forces(self) -> dict[str, Array]:
         """Return the multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.
@@ -400,22 +472,28 @@ class Run(HasSummary):
         """Return an xarray Dataset by t, coordinate, independent, motor, row and point (needs the extra `data`)."""
         return to_dataset(self)
 
-    def to_pandas(self) -> pandas.DataFrame:
+    def to_pandas(self, columns: Sequence[str] | None = None) -> pandas.DataFrame:
         """Return a pandas DataFrame by t with the columns of `to_csv` (needs the extra `data`)."""
-        return to_data_frame(self)
+        return to_data_frame(self.t, list_columns(self, columns, "Run.to_pandas"))
 
-    def to_csv(self, path: str | Path) -> Path:
-        """Write the run as CSV: t, each coordinate by its name, v.NAME, u.NAME, tau.MOTOR, phi.ROW, w.ROW, energy.
+    def to_csv(self, path: str | Path, columns: Sequence[str] | None = None) -> Path:
+        """Write the run as CSV, with all digits of each number.
 
-        Points are POINT.x, POINT.y, POINT.z. All digits of each number are written.
+        Parameters
+        ----------
+        path : str or Path
+        columns : sequence of str, optional
+            Names as in ``run[name]``. Default: coordinates, ``v.``, ``u.``, ``tau.``, the desired motion and the errors
+            if there are any, positions and velocities of points, ``phi.``, ``w.``, ``energy.total``, and ``energy``,
+            its older name.
 
         Raises
         ------
         InputError
-            The file cannot be written, or a joint has the name of another column.
+            The file cannot be written, a column is unknown, or a joint has the name of another column.
         """
         require_path(path, "Run.to_csv: path")
-        write_atomic(Path(path), to_csv_text(self))
+        write_atomic(Path(path), to_csv_text(self.t, list_columns(self, columns)))
         return Path(path)
 
     # --- files -----------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.native import Loop, StopReason
 from ckc_pin.run.compiled_terms import COMPILE_AFTER_RHS, NEVER, compile_during_run
+from ckc_pin.run.desired_path import find_target
 from ckc_pin.run.events import Event, list_occurrences
 from ckc_pin.run.loop_terms import require_number
 from ckc_pin.run.prepare import Prepared, prepare
@@ -154,6 +155,7 @@ def build_run(
         warnings=tuple(warnings),
         profile={name: {"calls": calls, "seconds": seconds} for name, (calls, seconds) in loop.profile().items()},
         built_mechanism=mechanism,
+        built_target=find_target(prepared.controller),
         **parts,
     )
     return run.with_warnings(run.list_speed_warnings())

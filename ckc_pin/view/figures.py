@@ -21,7 +21,7 @@ from ckc_pin.run.run import Run
 from ckc_pin.view import panels, style
 from ckc_pin.view.geometry import projection_planes
 from ckc_pin.view.layout import PanelSlot, create_page, fit_legend, legend_line, write_figure
-from ckc_pin.view.run_group import RunGroup, compute_desired_path, require_runs
+from ckc_pin.view.run_group import RunGroup, require_runs
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, figure_style
 
 if TYPE_CHECKING:
@@ -125,7 +125,9 @@ def _group_runs(runs: Iterable[Run]) -> list[RunGroup]:
     groups = []
     for (kind, *_), group_runs in members.items():
         ordered = style.sort_for_drawing(group_runs)
-        groups.append(RunGroup(kind, ordered, [compute_desired_path(run) for run in ordered]))
+        groups.append(
+            RunGroup(kind, ordered, [run.desired_path if "controller" in run.scene else None for run in ordered])
+        )
     return groups
 
 

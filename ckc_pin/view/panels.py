@@ -14,11 +14,12 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import motor_units
+from ckc_pin.run.desired_path import DesiredPath
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.geometry import Placements, Projection, compute_placements, project_base, project_outline
 from ckc_pin.view.layout import PanelSlot, add_note, clip_end_peaks, fit_legend, legend_line, set_panel_title
-from ckc_pin.view.run_group import DesiredPath, RunGroup, coordinate_columns
+from ckc_pin.view.run_group import RunGroup, coordinate_columns
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, rate_symbol
 
 __all__ = ["INITIAL_COLOUR", "TARGET_COLOUR", "coordinate_unit", "draw_configuration_space", "draw_coordinates",
@@ -56,7 +57,7 @@ def draw_coordinates(slot: PanelSlot, group: RunGroup, names: Sequence[str]) -> 
         def convert(q: Array, name: str, unit: str = unit) -> Array:
             return q / (2 * np.pi) if unit == "turns" else _wrap(q) if name in wrapped else q
 
-        _plot_curves(ax, group, unit_names, lambda run, name: convert(run.q_tree[:, run.column(name)], name))
+        _plot_curves(ax, group, unit_names, lambda run, name: convert(run[name], name))
         _plot_desired(ax, group, unit_names, lambda desired, k, name: convert(desired.q[:, k], name))
         ax.set_ylabel(axis_label(coordinate_symbol(unit_names[0]) if len(unit_names) == 1 else "$q$", unit))
         if wrapped and unit == "rad":
@@ -74,7 +75,7 @@ def draw_rates(slot: PanelSlot, group: RunGroup, names: Sequence[str]) -> None:
     """Draw rates over time, and those of a desired trajectory as dots."""
     names_by_unit = _group_by_unit(names, lambda name: f"{coordinate_unit(group, name)}/s")
     for (unit, unit_names), ax in zip(names_by_unit.items(), slot.add_axes(len(names_by_unit)), strict=True):
-        _plot_curves(ax, group, unit_names, lambda run, name: run.v_tree[:, run.column(name)])
+        _plot_curves(ax, group, unit_names, lambda run, name: run[f"v.{name}"])
         if group.kind == "tracking":
             _plot_desired(ax, group, unit_names, lambda desired, k, _: desired.q_dot[:, k])
         curves = [(run.t, run.v_tree[:, coordinate_columns(run, unit_names)]) for run in group.runs]
@@ -90,8 +91,7 @@ def draw_errors(slot: PanelSlot, group: RunGroup, names: Sequence[str]) -> None:
         for name in _sort_grey_first(group, unit_names):
             for run, desired, line_style in zip(group.runs, group.desired_paths, group.line_styles, strict=True):
                 if desired is not None:
-                    error = run.q_tree[:, run.column(name)] - desired.q[:, run.independent.index(name)]
-                    ax.plot(run.t, error, **_curve_style(group, name, line_style))
+                    ax.plot(run.t, run[f"error.{name}"], **_curve_style(group, name, line_style))
         ax.set_ylabel(axis_label("$q - q_d$", unit))
     _label_time(slot, group, len(names_by_unit))
 
@@ -105,7 +105,7 @@ def draw_efforts(slot: PanelSlot, group: RunGroup, names: Sequence[str], note: s
     units = motor_units(group.mechanism)
     names_by_unit = _group_by_unit(names, lambda name: units[run.actuated.index(name)])
     for (unit, unit_names), ax in zip(names_by_unit.items(), slot.add_axes(len(names_by_unit)), strict=True):
-        _plot_curves(ax, group, unit_names, lambda run, name: run.tau[:, run.actuated.index(name)])
+        _plot_curves(ax, group, unit_names, lambda run, name: run[f"tau.{name}"])
         columns = [run.actuated.index(name) for name in unit_names]
         curves = [(run.t, run.tau[:, columns]) for run in group.runs]
         clipped = clip_end_peaks(ax, curves, group.t_shown, group.has_small_panels)

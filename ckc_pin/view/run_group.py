@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,21 +9,16 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
-from ckc_pin.base.sources import Sources
-from ckc_pin.base.toml import convert
 from ckc_pin.base.validation import require_type
-from ckc_pin.control.desired import Desired
-from ckc_pin.control.point_path import make_desired
-from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
-from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.run.desired_path import DesiredPath
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.style import escape_mathtext, label_runs
 
-__all__ = ["DesiredPath", "DesiredPoses", "RunGroup", "compute_desired_path", "compute_desired_poses",
-           "coordinate_columns", "require_runs"]  # fmt: skip
+__all__ = ["DesiredPoses", "RunGroup", "compute_desired_poses", "coordinate_columns", "require_runs"]
 
 SETTLING_RATIO = 0.01  # a set-point motion has settled when its error is below this fraction of the initial error
 
@@ -49,52 +43,6 @@ def require_runs(runs: Any, where: str) -> list[Run]:
 
 
 @dataclass(frozen=True)
-class DesiredPath:
-    """Desired independent coordinates q_d along a run.
-
-    Attributes
-    ----------
-    kind : "set_point" or "tracking"
-    q, q_dot : (m, d) arrays
-        At the run's output times, in the order of `independent`.
-    """
-
-    kind: str
-    q: Array
-    q_dot: Array
-
-
-def compute_desired_path(run: Run) -> DesiredPath | None:
-    """Evaluate q_d and its rate at a run's output times. They follow from the scene that the run carries.
-
-    Returns
-    -------
-    DesiredPath or None
-        None if the scene has no controller, or a controller without a desired motion.
-
-    Raises
-    ------
-    InputError
-        The scene does not define the desired motion, for example in a damaged run file.
-    """
-    if "controller" not in run.scene:
-        return None
-    spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
-    if isinstance(spec, TorquesSpec):
-        return None
-    if isinstance(spec, SetPointSpec):
-        q_d = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
-        return DesiredPath("set_point", np.tile(q_d, (len(run.t), 1)), np.zeros((len(run.t), len(q_d))))
-    sources = Sources(run.scene_name, None, run.texts)
-    desired: Desired = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
-    samples = np.full((len(run.t), 2, len(run.independent)), np.nan)
-    for k, t in enumerate(run.t):
-        with suppress(NumericalError):  # The path of a point has left the workspace; nothing is drawn from there on.
-            samples[k] = desired(float(t))[:2]
-    return DesiredPath("tracking", samples[:, 0], samples[:, 1])
-
-
-@dataclass(frozen=True)
 class DesiredPoses:
     """Desired configurations of the whole mechanism at some output times of a run.
 
@@ -112,7 +60,7 @@ class DesiredPoses:
 
 def compute_desired_poses(run: Run, rows: IntArray) -> DesiredPoses | None:
     """Compute sigma(q_d) at some output times of a run; None if the scene has no desired motion."""
-    desired = compute_desired_path(run)
+    desired = run.desired_path
     if desired is None:
         return None
     mechanism = run.mechanism

@@ -98,10 +98,10 @@ def test_run_is_indexed_by_coordinate_and_array_name(swing: Run) -> None:
     assert swing["energy"] is swing.energy
     with pytest.raises(
         InputError,
-        match=r"run\['theta_9'\]: no such .* the coordinates theta_1, .*, and the arrays t",
+        match=r"run\['theta_9'\]: no such quantity; .* 'theta_1', .* the coordinates theta_1, .*, and the arrays t",
     ):
         swing["theta_9"]
-    with pytest.raises(InputError, match=r"run\[3\]: no such coordinate"):
+    with pytest.raises(InputError, match=r"run\[3\]: no such quantity"):
         swing[3]  # type: ignore[index]
 
 
