@@ -316,11 +316,12 @@ def _write_chunks(
 def _describe_content(task: SweepTask, members: Members) -> dict[str, Any]:
     """Return everything that the results depend on."""
     functions = {name: getattr(f, "__qualname__", type(f).__qualname__) for name, f in task.functions.items()}
+    named = {name: x if isinstance(x, str) else x.to_dict() for name, x in task.spec.outputs.items()}
     files = {file: Sources(task.name, task.folder).text(file) for v in task.spec.variables.values() if (file := v.file)}
     return {
         "scene_name": members.scene.name, "scene": members.scene.to_dict() | {"name": members.scene.name},
         "texts": members.ready.texts, "variables": msgspec.to_builtins(task.spec.variables), "files": files,
-        "outputs": {**msgspec.to_builtins(task.spec.outputs), **functions}, "members": task.variables.count,
+        "outputs": {**named, **functions}, "members": task.variables.count,
         "seed": task.spec.seed, "terms": members.terms,
     }  # fmt: skip
 

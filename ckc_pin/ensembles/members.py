@@ -25,7 +25,7 @@ from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.sources import Sources
 from ckc_pin.codegen.arguments import present
 from ckc_pin.codegen.library import Library, compile_terms, explain_too_large, find_compiled_terms
-from ckc_pin.ensembles.outputs import Function, Outputs, Recorded
+from ckc_pin.ensembles.outputs import TIME_TOLERANCE, Function, NamedQuantity, Output, Outputs, Recorded
 from ckc_pin.ensembles.spec import OutputSpec, SweepSpec
 from ckc_pin.ensembles.variables import Variables, check_variable_names
 from ckc_pin.errors import CkcError, InputError
@@ -236,7 +236,12 @@ class Members:
     def units(self) -> dict[str, tuple[str, ...]]:
         """Units of each variable, and of the components of each output that is not a function, by name."""
         variable_units = {name: (key_unit(self.mechanism, name),) for name in self.names}
-        return variable_units | {name: output.units for name, output in self.outputs.outputs.items()}
+        return variable_units | {name: output.units for name, output in self._all_outputs().items()}
+
+    def _all_outputs(self) -> dict[str, Output | NamedQuantity]:
+        """Return all outputs whose dimensions and units are known, that is without the caller's functions."""
+        derived = {name: x for name, x in self.outputs.functions.items() if isinstance(x, NamedQuantity)}
+        return {**self.outputs.outputs, **derived}
 
     def count_rhs(self) -> int:
         """Run the scene itself, and return its number of right-hand sides."""
@@ -343,7 +348,7 @@ class Members:
         )
         if self.outputs.functions:
             run = build_run(ready, rows, status=ended, message=message, wall_s=0.0)
-            for name, function in self.outputs.functions.items():
+            for name, function in member_outputs.functions.items():
                 try:
                     outputs[name][k] = function(run)
                 except Exception as error:  # a caller's function may raise anything
@@ -355,12 +360,18 @@ class Members:
     def _require_equal_instants(self) -> None:
         """Refuse trajectories if output instants differ between members (InputError)."""
         time_variables = [name for name in self.names if name in ("t_end", "solver.output_dt")]
-        trajectories = [name for name, output in self.outputs.outputs.items() if "time" in output.dims]
+        dims_of = {name: output.dims for name, output in self._all_outputs().items()}
+        trajectories = [name for name, dims in dims_of.items() if "time" in dims]
         if time_variables and trajectories:
             raise InputError(
                 f"{self.scene.name}: outputs: {trajectories[0]}: a trajectory needs the same output instants for all "
                 f"members, but {time_variables[0]} varies; use a reduction"
             )
+        t_end = float(self.ready.instants[-1])
+        for name, spec in self._output_specs.items():
+            at = spec.at if isinstance(spec, OutputSpec) else None
+            if at is not None and at > t_end * (1 + TIME_TOLERANCE) and not time_variables:
+                raise InputError(f"{self.scene.name}: outputs: {name}: at = {at:g} s is after t_end = {t_end:g} s")
 
     def _find_shapes(self) -> dict[str, tuple[tuple[str, ...], tuple[int, ...]]]:
         """Return dimensions and shape of each output; functions are called on a run of the scene itself."""
@@ -375,10 +386,13 @@ class Members:
             try:
                 value = np.asarray(function(run), dtype=float)
             except Exception as error:  # a caller's function may raise anything
+                if isinstance(function, NamedQuantity):
+                    raise InputError(f"outputs: {name}: {error}") from error
                 raise InputError(
                     f"outputs: {name} raised {type(error).__name__} for the scene itself: {error}"
                 ) from error
-            shapes[name] = (tuple(f"{name}_{k}" for k in range(value.ndim)), value.shape)
+            dims = function.dims if isinstance(function, NamedQuantity) else None
+            shapes[name] = (tuple(f"{name}_{k}" for k in range(value.ndim)) if dims is None else dims, value.shape)
         return shapes
 
     def _select_library(self, count: int) -> Library | None:

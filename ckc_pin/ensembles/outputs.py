@@ -1,4 +1,4 @@
-"""Outputs of an ensemble's members: reductions of recorded quantities, or functions of a `Run`."""
+"""Outputs of an ensemble's members: reductions of recorded or derived quantities, or functions of a `Run`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.ensembles.spec import OutputSpec, Reduction
+from ckc_pin.ensembles.spec import OutputSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.units import joined
-from ckc_pin.run.columns import integral_unit, quantity_units
+from ckc_pin.run.columns import integral_unit, list_quantities, quantity_units, unknown_quantity
 from ckc_pin.run.prepare import Prepared
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import record_columns
 
-__all__ = ["NAMED_REDUCTIONS", "Function", "Output", "Outputs", "Recorded"]
+__all__ = ["NAMED_REDUCTIONS", "TIME_TOLERANCE", "Function", "NamedQuantity", "Output", "Outputs", "Recorded"]
 
 Function = Callable[[Run], Any]
 
@@ -33,6 +33,8 @@ VECTORS = {"q_tree": "coordinate", "v_tree": "coordinate", "u": "independent", "
 SCALARS = ("energy", "dissipated", "lyapunov", "t")
 DERIVED = ("settled", "energy_drift")
 EVENT = "event."
+TIME_TOLERANCE = 1e-9  # of an instant after the end of a run, relative to the end
+COLUMNS_OF = {"phi_max": "max_phi"} | {name: name for name in ("q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,45 @@ class Output:
     compute: Callable[[Recorded], Array]
 
 
+@dataclass(frozen=True)
+class NamedQuantity:
+    """A reduction of a quantity that a run derives from its rows, such as ``tip.x``: a function of a `Run`.
+
+    Attributes
+    ----------
+    name, unit : str
+    spec : OutputSpec
+    instants : (m,) array
+        Output instants of the member.
+    """
+
+    name: str
+    unit: str
+    spec: OutputSpec
+    instants: Array
+
+    def __call__(self, run: Run) -> Any:
+        """Return the reduction for a run. A trajectory is NaN after the run's end."""
+        values = run[self.name]
+        if self.spec.reduction == "end":
+            return values[-1]
+        series = np.full((1, 1, len(self.instants)), np.nan)
+        index = np.minimum(np.searchsorted(self.instants, run.t), len(self.instants) - 1)
+        is_output = self.instants[index] == run.t  # the last row of a run that stopped may lie between two instants
+        series[0, 0, index[is_output]] = values[is_output]
+        return _reduce(series, self.spec, self.instants)[0, 0]
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit, as of an `Output`."""
+        return (self.unit,)
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of the result."""
+        return ("time",) if self.spec.reduction == "trajectory" else ()
+
+
 class Outputs:
     """The outputs of a sweep for a prepared scene.
 
@@ -84,20 +125,24 @@ class Outputs:
     needs_series : bool
         Whether an output needs more than the last row.
     functions : dict of str to callable
-        Outputs that are functions of a run.
+        Outputs that are functions of a run: the caller's, and quantities that rows do not contain.
     outputs : dict of str to Output
         All other outputs.
     """
 
     def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
         self._ready, self._slices = ready, record_columns(ready.loop)
-        self._units = quantity_units(ready.mechanism)
+        self._units, self._quantities = quantity_units(ready.mechanism), list_quantities(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
         self.outputs: dict[str, Output] = {}
         for name, spec in specs.items():
             if callable(spec):
                 self.functions[name] = spec
+                continue
+            named = self._find_derived(spec)
+            if named is not None:
+                self.functions[name] = named
             else:
                 self.outputs[name] = self._create_output(name, spec)
         self.needs_series = bool(self.columns) or bool(self.functions)
@@ -130,6 +175,19 @@ class Outputs:
 
     # --- construction ----------------------------------------------------------------------------
 
+    def _find_derived(self, spec: str | OutputSpec) -> NamedQuantity | None:
+        """Return the output of a quantity that is not recorded in rows, or None of other quantities."""
+        spec = OutputSpec(of=spec) if isinstance(spec, str) else spec
+        quantity = self._quantities.get(spec.of)
+        if quantity is None or quantity.array in (*COLUMNS_OF, "error") or self._is_special(spec.of):
+            return None
+        unit = integral_unit(quantity.unit) if spec.reduction == "integral" else quantity.unit
+        return NamedQuantity(spec.of, unit, spec, self._ready.instants)
+
+    def _is_special(self, name: str) -> bool:
+        """Whether a name denotes an output that is no single quantity of the naming scheme."""
+        return name in (*VECTORS, *SCALARS, *DERIVED, *NAMED_REDUCTIONS) or name.startswith(EVENT)
+
     def _create_output(self, name: str, spec: str | OutputSpec) -> Output:
         if isinstance(spec, str):
             if spec in NAMED_REDUCTIONS:
@@ -154,14 +212,14 @@ class Outputs:
         columns, dims, reference = self._find_columns(name, spec.of)
         shape = (len(columns),) if dims else ()
         units = self._units_of(spec)
-        if spec.reduce == "end" and reference is None:
+        if spec.reduction == "end" and reference is None:
             return Output(dims, shape, units, lambda recorded: _squeeze(recorded.last_row[:, columns], dims))
-        indices, reduction = self._require_series(columns), spec.reduce
+        indices, reduction = self._require_series(columns), spec.reduction
 
         def compute(recorded: Recorded) -> Array:
             x = recorded.series[:, indices]
             x = x if reference is None else x - reference
-            return _squeeze(_reduce(x, reduction, self._ready.instants), dims)
+            return _squeeze(_reduce(x, spec, self._ready.instants), dims)
 
         if reduction == "trajectory":
             return Output((*dims, "time"), (*shape, len(self._ready.instants)), units, compute)
@@ -169,31 +227,36 @@ class Outputs:
 
     def _create_unknown(self, spec: OutputSpec) -> Output:
         """Return an output of a scalar that is NaN, because a run does not compute it."""
-        instants = len(self._ready.instants) if spec.reduce == "trajectory" else None
+        instants = len(self._ready.instants) if spec.reduction == "trajectory" else None
         dims, shape = ((), ()) if instants is None else (("time",), (instants,))
         return Output(
             dims, shape, self._units_of(spec), lambda recorded: np.full((len(recorded.last_row), *shape), np.nan)
         )
 
-    def _find_columns(self, name: str, quantity: str) -> tuple[list[int], tuple[str, ...], Array | None]:
+    def _find_columns(self, name: str, name_of: str) -> tuple[list[int], tuple[str, ...], Array | None]:
         """Return the columns of a quantity, its dimensions, and the values over time that are subtracted from it."""
-        mechanism, q = self._ready.mechanism, self._slices["q_tree"].start
-        if quantity in mechanism.tree.index:
-            return [q + mechanism.tree.index[quantity]], (), None
-        if quantity == "error":
-            return [q + int(k) for k in mechanism.partition.q], ("independent",), self._compute_q_d(name)
-        if quantity in VECTORS or quantity in SCALARS:
-            columns = self._slices[quantity]
-            dims = (VECTORS[quantity],) if quantity in VECTORS else ()
-            return list(range(columns.start, columns.stop)), dims, None
-        choices = ", ".join([*VECTORS, *SCALARS, *DERIVED, f"{EVENT}NAME", *NAMED_REDUCTIONS, *mechanism.coordinates])
-        raise InputError(f"outputs: {name}: no {quantity!r}; there are {choices}")
+        mechanism, quantity = self._ready.mechanism, self._quantities.get(name_of)
+        if name_of not in mechanism.tree.index and (name_of in VECTORS or name_of in SCALARS):
+            if name_of == "error":
+                start = self._slices["q_tree"].start
+                columns = [start + int(k) for k in mechanism.partition.q]
+                return columns, ("independent",), self._compute_q_d(name)
+            dims = (VECTORS[name_of],) if name_of in VECTORS else ()
+            return list(range(self._slices[name_of].start, self._slices[name_of].stop)), dims, None
+        if quantity is None:
+            arrays = [*VECTORS, *SCALARS, *DERIVED, f"{EVENT}NAME", *NAMED_REDUCTIONS]
+            raise unknown_quantity(f"outputs: {name}: {name_of!r}", name_of, mechanism, arrays)
+        column = quantity.column or 0
+        if quantity.array == "error":
+            start = self._slices["q_tree"].start
+            return [start + int(mechanism.partition.q[column])], (), self._compute_q_d(name)[[column]]
+        return [self._slices[COLUMNS_OF[quantity.array]].start + column], (), None
 
     def _units_of(self, spec: OutputSpec) -> tuple[str, ...]:
         """Return the unit of each component; an integral is over time."""
-        index = self._ready.mechanism.tree.index
-        units = [self._units["q_tree"][index[spec.of]]] if spec.of in index else self._units[spec.of]
-        return tuple(integral_unit(unit) if spec.reduce == "integral" else unit for unit in units)
+        is_vector = spec.of in self._units and spec.of not in self._ready.mechanism.tree.index
+        units = self._units[spec.of] if is_vector else [self._quantities[spec.of].unit]
+        return tuple(integral_unit(unit) if spec.reduction == "integral" else unit for unit in units)
 
     def _compute_q_d(self, name: str) -> Array:
         """Return q_d at the output instants, (d, instants)."""
@@ -252,13 +315,17 @@ def _compute_drift(energy: Array) -> Array:
     return np.fmax.reduce(np.abs(energy - energy[:, :1]), axis=1)
 
 
-def _reduce(x: Array, reduction: Reduction, instants: Array) -> Array:
+def _reduce(x: Array, spec: OutputSpec, instants: Array) -> Array:
     """Reduce (members, columns, instants) over time, ignoring instants after a member's end.
 
     Each sum runs over one member's row, which is contiguous in memory, so that it does not depend on other members.
     """
+    reduction = spec.reduction
     if reduction == "trajectory":
         return x
+    if spec.at is not None:
+        is_within = spec.at <= instants[-1] * (1 + TIME_TOLERANCE)
+        return x[:, :, int(np.argmin(np.abs(instants - spec.at)))] if is_within else np.full(x.shape[:2], np.nan)
     if reduction == "end":
         is_recorded = ~np.isnan(x)
         last = x.shape[2] - 1 - np.argmax(is_recorded[:, :, ::-1], axis=2)

@@ -128,14 +128,18 @@ class OutputSpec(_Spec, frozen=True):
     Attributes
     ----------
     of
-        A coordinate, ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``,
-        ``dissipated`` (NaN with ``friction_smoothing``), ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``,
-        ``max_phi``, ``energy_drift`` (largest change), ``settled`` (1 if all rates are zero at the end, and q = q_d
-        of a set point; else 0), ``event.NAME`` or ``event.K`` (its first occurrence, s).
+        A quantity by its name, such as ``theta_1``, ``tau.MOTOR``, ``error.theta_1`` or ``tip.x`` (see "names");
+        ``q_tree``, ``v_tree``, ``u``, ``tau``, ``phi``, ``error`` (q - q_d), ``energy``, ``dissipated`` (NaN with
+        ``friction_smoothing``), ``lyapunov``, ``t``; ``max_abs_u``, ``max_abs_tau``, ``max_phi``, ``energy_drift``
+        (largest change), ``settled`` (1 if all rates are zero at the end, and q = q_d of a set point; else 0),
+        ``event.NAME`` or ``event.K`` (its first occurrence, s).
         ``of = "error"``
     reduce
         Reduction over the member's output instants. The quantities that are listed after ``t`` are already reduced.
         ``reduce = "max_abs"``
+    at : s
+        Instead of ``reduce``: the value at the output instant nearest to this time. NaN if a member ended before.
+        ``at = 0.5``
     tolerance : rad, of the size
         For ``settled``, of each coordinate and its rate.
         ``tolerance = 1e-4``
@@ -143,7 +147,18 @@ class OutputSpec(_Spec, frozen=True):
 
     of: Annotated[str, msgspec.Meta(min_length=1)]
     reduce: Reduction = "end"
+    at: Annotated[float, msgspec.Meta(ge=0)] | None = None
     tolerance: Annotated[float, msgspec.Meta(gt=0)] = 1e-3
+
+    @property
+    def reduction(self) -> Reduction | None:
+        """The reduction over time; None for the value at a time."""
+        return self.reduce if self.at is None else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the output as data. Without `at` they are as in stores of earlier versions, which can be resumed."""
+        data: dict[str, Any] = msgspec.to_builtins(self)
+        return {key: value for key, value in data.items() if key != "at" or value is not None}
 
 
 class SweepSpec(_Spec, frozen=True):
@@ -201,6 +216,9 @@ def parse_sweep(data: dict[str, Any], sources: Sources) -> SweepSpec:
     spec = convert(data, SweepSpec, sources.name)
     for name, variable in spec.variables.items():
         _require_valid(name, variable, sources.name)
+    for name, output in spec.outputs.items():
+        if isinstance(output, OutputSpec) and output.reduce != "end" and output.at is not None:
+            raise InputError(f"{sources.name}: outputs: {name}: give reduce or at, not both")
     if not spec.variables:
         raise InputError(f'{sources.name}: variables: name at least one, e.g. "initial.q.JOINT" = {{uniform = [a, b]}}')
     if not spec.outputs:

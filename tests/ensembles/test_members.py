@@ -240,7 +240,7 @@ def test_events_end_members_and_their_times_are_outputs() -> None:
         (("controller.K_P",), OUTPUTS, "is not a number of the scene"),
         (("solver.rtoll",), OUTPUTS, "unknown key"),
         (("link.link_2.com",), OUTPUTS, "vary link.link_2.com.x, .y or .z"),
-        (("epsilon",), {"x": "theta_9"}, "no 'theta_9'; there are q_tree"),
+        (("epsilon",), {"x": "theta_9"}, "'theta_9': no such quantity; the nearest names are 'theta_1'"),
         (("epsilon",), {"x": "event.0"}, "the scene has no event '0'"),
         (("epsilon",), {"x": "error"}, "has no q_d"),
         (("epsilon",), {"x": lambda run: 1 / 0}, "x raised ZeroDivisionError for the scene itself"),

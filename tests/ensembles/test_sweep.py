@@ -201,7 +201,7 @@ def test_the_store_of_another_sweep_is_not_changed(tmp_path: Path) -> None:
         ("", ["--scheduler", "nonsense://x"], "does not answer within"),
         ("", ["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
         ("", ["--worst", "none"], "no such output; there are end, path, drift"),
-        ('end2 = "theta_9"\n', [], "no 'theta_9'"),
+        ('end2 = "theta_9"\n', [], "'theta_9': no such quantity"),
         ('path = "u"\n', [], "malformed TOML"),
         ("[extra]\n", [], "unknown key 'extra'"),
         ('status = "u"\n', [], "'status' is taken"),
