@@ -224,12 +224,12 @@ def play(
     )
 
 
-def plot(*shown: Run | LinearModel | GainLocus | Sensitivities) -> Figures:
-    """Draw figures of runs, a linear model, a root locus or sensitivities.
+def plot(*shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces) -> Figures:
+    """Draw figures of runs, a linear model, a root locus, sensitivities or inverse dynamics.
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus or Sensitivities
+    shown : Run, or one LinearModel, GainLocus, Sensitivities or MotionForces
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
 
     Returns

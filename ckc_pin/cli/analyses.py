@@ -22,6 +22,8 @@ from ckc_pin.cli.output import (
     print_json,
     print_summary,
     print_table,
+    print_written,
+    require_file_path,
     skip_figures_without_matplotlib,
 )
 from ckc_pin.cli.signals import interrupts
@@ -41,6 +43,7 @@ MODEL_FILES = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # of an ear
 @click.command(
     epilog=options.format_examples(
         "ckc inverse five_bar/tracking --out forces --figures",
+        "ckc inverse five_bar/tracking --csv forces.csv",
         "ckc inverse five_bar/tracking --set controller.torque_limit=1.2 --json",
         "ckc inverse runs/spf",
     )
@@ -54,12 +57,16 @@ MODEL_FILES = re.compile(r"mode_\d+\.npz|(poles|modes|locus)\.png")  # of an ear
 @options.overrides
 @options.out(help="Folder for inverse.npz.")
 @options.figures
+@options.csv(help="Also write motion and forces as a CSV file, a row for each instant; columns are named quantities.")
 @options.as_json
-def inverse(what: str, overrides: dict[str, Any], out: Path | None, figures: bool, as_json: bool) -> None:
+def inverse(
+    what: str, overrides: dict[str, Any], out: Path | None, figures: bool, csv: Path | None, as_json: bool
+) -> None:
     """Compute motor, loop and joint forces along a motion. It is a scene's desired motion, or that of a run."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
+    require_file_path(csv, "--csv")
     with ProgressBar(what) as progress:
         forces = ckc_pin.inverse_dynamics(what, overrides, progress=progress)
     if out is not None:
@@ -69,6 +76,11 @@ def inverse(what: str, overrides: dict[str, Any], out: Path | None, figures: boo
     else:
         print_summary(forces.summary())
         print(format_destination(out, "inverse.npz, for other programs"))
+    if csv is not None:
+        with interrupts.deferred():
+            forces.to_csv(csv)
+        if not as_json:
+            print_written([csv])
     exit_unless_done(forces.status, forces.message)
 
 

@@ -23,8 +23,8 @@ from ckc_pin.errors import InputError
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-__all__ = ["PATH", "as_json", "complete_scenes", "figures", "format_examples", "mechanism", "open_browser", "out",
-           "overrides", "overwrite", "port", "read_overrides", "read_table", "require_folder", "require_speed",
+__all__ = ["PATH", "as_json", "complete_scenes", "csv", "figures", "format_examples", "mechanism", "open_browser",
+           "out", "overrides", "overwrite", "port", "read_overrides", "read_table", "require_folder", "require_speed",
            "runs"]  # fmt: skip
 
 MAX_QUOTED = 80  # characters of a user's text in a message
@@ -93,6 +93,7 @@ runs = click.argument(
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing files.")
 figures = click.option("--figures", is_flag=True, help="With --out: also draw figures there.")
 out = partial(click.option, "--out", metavar="DIR", type=PATH)
+csv = partial(click.option, "--csv", metavar="FILE", type=PATH)
 port = click.option("--port", metavar="PORT", type=int, default=0, help="Port on 127.0.0.1; 0: any free one.")
 open_browser = click.option("--open", "open_browser", is_flag=True, help="Also open the default browser.")
 

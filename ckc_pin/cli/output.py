@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = ["LONG_S", "ProgressBar", "Spinner", "create_table", "error_console", "exit_unless_done",
            "format_destination", "has_printed_json", "is_terminal", "make_folder", "print_json", "print_summary",
-           "print_table", "print_written", "reset_json", "skip_figures_without_matplotlib"]  # fmt: skip
+           "print_table", "print_written", "require_file_path", "reset_json",
+           "skip_figures_without_matplotlib"]  # fmt: skip
 
 LONG_S = 10.0  # a command that may take longer announces it
 ESTIMATE_DELAY_S = 2.0  # the remaining time is estimated from the progress in this time
@@ -135,6 +136,20 @@ def make_folder(out: Path, option: str = "--out ") -> None:
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise InputError(f"{option}{out}: no folder that can be written to: {error.strerror}") from None
+
+
+def require_file_path(path: Path | None, option: str) -> None:
+    """Check before a computation that a file can be written, if one is asked for, and create its folder.
+
+    Raises
+    ------
+    InputError
+        It is a folder, or its folder cannot be written to.
+    """
+    if path is not None and path.is_dir():
+        raise InputError(f"{option} {path}: expected the name of a file, got a folder")
+    if path is not None:
+        make_folder(path.parent, f"{option} {path}: ")
 
 
 # --- progress ------------------------------------------------------------------------------------

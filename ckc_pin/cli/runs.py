@@ -25,6 +25,7 @@ from ckc_pin.cli.output import (
     print_json,
     print_summary,
     print_written,
+    require_file_path,
     skip_figures_without_matplotlib,
 )
 from ckc_pin.cli.signals import DONE, STOPPED, interrupt_code, interrupts
@@ -43,6 +44,7 @@ __all__ = ["format_profile", "play", "plot", "run"]
     epilog=options.format_examples(
         "ckc run five_bar/tracking --out runs/spf",
         "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
+        "ckc run five_bar/tracking --csv tracking.csv",
         "ckc run five_bar/tracking --meshcat --speed 1",
         "ckc run . --out first --figures",
     )
@@ -56,6 +58,7 @@ __all__ = ["format_profile", "play", "plot", "run"]
 @options.overrides
 @options.out(help="Folder for run.npz and for scene.json, the scene with all defaults.")
 @options.figures
+@options.csv(help="Also write the run as a CSV file, a row for each output instant; columns are named quantities.")
 @click.option("--profile", is_flag=True, help="Print how often each term was evaluated and the time it took.")
 @click.option(
     "--meshcat", is_flag=True, help="Show the simulation in the browser, then play it back; Ctrl-C ends the command."
@@ -71,6 +74,7 @@ def run(
     overrides: dict[str, Any],
     out: Path | None,
     figures: bool,
+    csv: Path | None,
     profile: bool,
     meshcat: bool,
     speed: float | None,
@@ -89,6 +93,7 @@ def run(
         error_console().print(f"warning: {warning}")
     if out is not None:
         make_folder(out)
+    require_file_path(csv, "--csv")
     with ExitStack() as stack:
         view = stack.enter_context(_open_live_view(scene, speed, port, open_browser)) if meshcat else None
         with ProgressBar(scene.name) as progress:
@@ -96,6 +101,7 @@ def run(
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
         finished = finished.with_warnings(warnings)
         code = _save_and_print(finished, out, figures, profile, as_json, warnings)
+        _write_csv(finished, csv, as_json)
         if view is not None and finished.status != "interrupted":
             try:
                 view.finish(finished, stay=True)
@@ -126,6 +132,15 @@ def _save_and_print(
         error_console().print(finished.message)
         return STOPPED if finished.status == "stopped" else interrupt_code(finished.message)
     return DONE if stop is None else interrupt_code(str(stop))
+
+
+def _write_csv(finished: ckc_pin.Run, csv: Path | None, as_json: bool) -> None:
+    if csv is None:
+        return
+    with interrupts.deferred():
+        finished.to_csv(csv)
+    if not as_json:
+        print_written([csv])
 
 
 def _require_meshcat_for_view_options(meshcat: bool, speed: float | None, port: int, open_browser: bool) -> None:

@@ -28,6 +28,7 @@ __all__ = [
     "list_columns",
     "list_quantities",
     "quantity_units",
+    "require_names",
     "to_csv_text",
     "to_data_frame",
     "to_dataset",
@@ -159,7 +160,7 @@ def list_columns(run: Run, names: Sequence[str] | None = None, where: str = "Run
         Unknown name, or two columns would have the same name.
     """
     if names is not None:
-        return {name: _select_named(run, name, f"{where}: columns") for name in _require_names(names, where)}
+        return {name: _select_named(run, name, f"{where}: columns") for name in require_names(names, where)}
     has_desired = run.desired is not None
     arrays = [name for name in TABLE_ARRAYS if has_desired or name not in DESIRED]
     columns = [
@@ -177,7 +178,8 @@ def list_columns(run: Run, names: Sequence[str] | None = None, where: str = "Run
     return by_name
 
 
-def _require_names(names: Any, where: str) -> list[str]:
+def require_names(names: Any, where: str) -> list[str]:
+    """Return the names of a table's columns as a list; raise InputError for other values."""
     if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         raise InputError(
             f'{where}: columns: expected a list of names, as ["theta_1", "tip.x"], got {describe_value(names)}'

@@ -64,6 +64,11 @@ class DerivedQuantities:
         """Smallest singular value of phi_z for the mechanism's independent coordinates, shape (m,)."""
         return self._evaluate(lambda terms: terms.at.sigma_min())
 
+    @property
+    def energy(self) -> Array:
+        """Kinetic and potential energy, shape (m,), J."""
+        return self.kinetic_energy + self.potential_energy
+
     def _evaluate(self, evaluate: Callable[[Terms], float]) -> Array:
         tree = self.mechanism.tree
         states = zip(self.q_tree, self.v_tree, strict=True)

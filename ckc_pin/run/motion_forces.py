@@ -5,20 +5,39 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.atomic_files import open_atomic, write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary
+from ckc_pin.base.validation import describe_value, require_path
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import motor_units
+from ckc_pin.run.columns import (
+    Quantity,
+    list_quantities,
+    require_names,
+    to_csv_text,
+    to_data_frame,
+    unknown_quantity,
+)
+from ckc_pin.run.derived import DerivedQuantities
 from ckc_pin.run.run import Status
+
+if TYPE_CHECKING:
+    import pandas
+
+    from ckc_pin.view.inline import Figures
 
 __all__ = ["MotionForces", "collect_forces"]
 
+OWN_ARRAYS = ("q_tree", "v_tree", "a_tree", "tau", "multipliers", "joint_wrenches")  # in the order of a table
+NOT_COMPUTED = ("u", "desired", "desired_dot", "error", "phi", "w", "phi_max")
 MOMENT_TOLERANCE = 1e-9  # of the force times the mechanism's size: a smaller moment is not printed
 LIMIT_TOLERANCE = 1e-9  # relative to a limit: a torque clipped at its limit may exceed it by rounding
 
@@ -26,6 +45,10 @@ LIMIT_TOLERANCE = 1e-9  # relative to a limit: a torque clipped at its limit may
 @dataclass(frozen=True, eq=False, repr=False)
 class MotionForces(HasSummary):
     """Forces in a mechanism along a motion. Arrays have a row for each instant.
+
+    ``forces["tau.theta_1"]`` is a motor torque, ``forces["loop.elbow.x"]`` the multiplier of a constraint row and
+    ``forces["joint.theta_2.fx"]`` a component of a joint's wrench; docs/reference/names.md lists the names. `plot`
+    draws them, `to_pandas` and `to_csv` export them.
 
     Attributes
     ----------
@@ -120,6 +143,82 @@ class MotionForces(HasSummary):
             "message": self.message,
         }
 
+    # --- access by name, figures, export ---------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a quantity along the motion by its name, shape (m,).
+
+        Parameters
+        ----------
+        name : str
+            ``theta_1``, ``v.theta_1``, ``a.theta_1``, ``tau.MOTOR``, ``loop.LOOP.ROW``, ``joint.JOINT.fx`` to ``.mz``,
+            ``tip.x``, ``tip.v.x``, ``energy.kinetic``, ``energy.potential``, ``energy.total``, ``sigma_min``.
+
+        Raises
+        ------
+        InputError
+            There is no such quantity; the message lists the nearest ones. Or inverse dynamics does not compute it.
+        """
+        quantity = self.quantities.get(str(name))
+        where = f"forces[{describe_value(name)}]"
+        if quantity is None:
+            raise unknown_quantity(where, name, self.mechanism)
+        if quantity.array in NOT_COMPUTED:
+            raise InputError(f"{where}: inverse dynamics has no such quantity; a run has it")
+        return quantity.select(getattr(self if quantity.array in OWN_ARRAYS else self._derived, quantity.array))
+
+    @cached_property
+    def quantities(self) -> dict[str, Quantity]:
+        """All names of quantities, with array, column and unit of each."""
+        return list_quantities(self.mechanism)
+
+    @cached_property
+    def _derived(self) -> DerivedQuantities:
+        return DerivedQuantities(self.t, self.q_tree, self.v_tree, self.mechanism)
+
+    @property
+    def multipliers(self) -> Array:
+        """Multipliers of eq. 1 by constraint row, shape (m, rows), N or N m."""
+        return np.hstack([np.zeros((len(self.t), 0)), *self.loop_forces.values()])
+
+    @property
+    def joint_wrenches(self) -> Array:
+        """Wrenches that the joints transmit, one after the other, shape (m, 6 joints)."""
+        return np.hstack([np.zeros((len(self.t), 0)), *self.joint_forces.values()])
+
+    def plot(self) -> Figures:
+        """Draw motor efforts and loop forces. A notebook shows the figure and `save(folder)` writes it."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def to_pandas(self, columns: Sequence[str] | None = None) -> pandas.DataFrame:
+        """Return a pandas DataFrame by t with the columns of `to_csv` (needs the extra `data`)."""
+        return to_data_frame(self.t, self._list_columns(columns, "MotionForces.to_pandas"))
+
+    def to_csv(self, path: str | Path, columns: Sequence[str] | None = None) -> Path:
+        """Write the motion and its forces as CSV, with all digits of each number.
+
+        Parameters
+        ----------
+        path : str or Path
+        columns : sequence of str, optional
+            Names as in ``forces[name]``. Default: coordinates, ``v.``, ``a.``, ``tau.``, ``loop.``, ``joint.``.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or a column is unknown.
+        """
+        require_path(path, "MotionForces.to_csv: path")
+        write_atomic(Path(path), to_csv_text(self.t, self._list_columns(columns, "MotionForces.to_csv")))
+        return Path(path)
+
+    def _list_columns(self, columns: Sequence[str] | None, where: str) -> dict[str, Array]:
+        if columns is None:
+            return {name: self[name] for name, quantity in self.quantities.items() if quantity.array in OWN_ARRAYS}
+        return {name: self[name] for name in require_names(columns, where)}
+
     @property
     def coordinates(self) -> tuple[str, ...]:
         """Names of the tree's coordinates."""
@@ -148,7 +247,7 @@ class MotionForces(HasSummary):
             "coordinates": np.array(self.coordinates, dtype=str),
             "actuated": np.array(self.actuated, dtype=str),
             "rows": np.array([".".join(name) for name in self.mechanism.closure.names], dtype=str),
-            "multipliers": np.hstack([np.zeros((len(self.t), 0)), *self.loop_forces.values()]),
+            "multipliers": self.multipliers,
             "loops": np.array(list(self.loop_wrenches), dtype=str),
             "loop_wrenches": _stack_wrenches(self.loop_wrenches, len(self.t)),
             "joints": np.array(list(self.joint_forces), dtype=str),

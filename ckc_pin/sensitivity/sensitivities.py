@@ -14,7 +14,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
-from ckc_pin.base.validation import require_callable, require_path, require_type
+from ckc_pin.base.validation import describe_value, require_callable, require_path, require_type, suggest_name
 from ckc_pin.control.controllers import ControlLaw, Controller
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.errors import InputError, NumericalError
@@ -22,7 +22,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Pose
 from ckc_pin.native import EventQuantity, NonDifferentiableReason
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
-from ckc_pin.run.columns import derivative_unit, key_unit
+from ckc_pin.run.columns import derivative_unit, key_unit, list_quantities, unknown_quantity
 from ckc_pin.run.events import Event
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run
@@ -32,6 +32,7 @@ from ckc_pin.sensitivity.parameters import sensitivity_setup
 
 __all__ = ["Sensitivities", "compute_point_sensitivities", "sensitivities"]
 
+POINT_PREFIX = "point:"  # older names of points begin with it
 EXPECTED_NAMES = 'a list of names, as ["link.link_2.mass"]'
 
 
@@ -76,6 +77,40 @@ class Sensitivities(HasSummary):
         mechanism = self.run.mechanism
         return compute_point_sensitivities(mechanism, self.sensitivity_parameters, self.run.q_tree, self.q_tree)
 
+    def __getitem__(self, key: str | tuple[str, str]) -> Array:
+        """Return the derivatives of a quantity by its name, as ``run[name]`` takes it.
+
+        Parameters
+        ----------
+        key : str or (str, str)
+            ``result["theta_1"]`` has a column for each parameter, shape (m, p).
+            ``result["tip.x", "link.rod.mass"]`` is the derivative with respect to one of them, shape (m,).
+
+        Raises
+        ------
+        InputError
+            Unknown quantity or parameter, or a quantity whose derivative is not computed. The message lists valid ones.
+        """
+        name, parameter = key if isinstance(key, tuple) and len(key) == 2 else (key, None)
+        quantity = list_quantities(self.run.mechanism).get(str(name).removeprefix(POINT_PREFIX))
+        arrays: dict[str, Array] = {"q_tree": self.q_tree, "v_tree": self.v_tree, "u": self.u, "tau": self.tau}
+        if quantity is not None and quantity.array == "point_positions":
+            arrays["point_positions"] = np.concatenate([*self.points.values()], axis=1)
+        if quantity is None:
+            raise unknown_quantity(f"sensitivities[{describe_value(name)}]", name, self.run.mechanism)
+        if quantity.array not in arrays:
+            raise InputError(
+                f"sensitivities[{describe_value(name)}]: this derivative is not computed; there are those of "
+                "coordinates, of v., u., tau., and of the positions of points"
+            )
+        values = arrays[quantity.array][:, quantity.column]
+        if parameter is None:
+            return values
+        if parameter not in self.parameters:
+            nearest = suggest_name(parameter, self.parameters)
+            raise InputError(f"no parameter {parameter!r} among these; there are {', '.join(self.parameters)}{nearest}")
+        return np.array(values[:, self.parameters.index(parameter)], dtype=float)
+
     def of(self, name: str, parameter: str) -> Array:
         """Return the derivative of a quantity with respect to a parameter along the run, shape (m,).
 
@@ -83,7 +118,7 @@ class Sensitivities(HasSummary):
         ----------
         name : str
             A coordinate, ``theta_1``, or its rate, ``v.theta_1``; a force on an independent coordinate, ``u.theta_1``;
-            a motor torque, ``tau.MOTOR``; a coordinate of a point, ``point:tip.x``.
+            a motor torque, ``tau.MOTOR``; a coordinate of a point, ``tip.x`` (formerly ``point:tip.x``).
         parameter : str
             One of `parameters`.
 
@@ -92,23 +127,7 @@ class Sensitivities(HasSummary):
         InputError
             Unknown quantity or parameter. The message lists the valid ones.
         """
-        if parameter not in self.parameters:
-            raise InputError(f"no parameter {parameter!r} among these; there are {', '.join(self.parameters)}")
-        curves = self._curves()
-        if name not in curves:
-            raise InputError(f"no {name!r}; there are {', '.join(curves)}")
-        return np.array(curves[name][:, self.parameters.index(parameter)], dtype=float)
-
-    def _curves(self) -> dict[str, Array]:
-        """Return the derivatives of every quantity, (m, p), by name."""
-        run, curves = self.run, dict[str, Array]()
-        parts = {"": (run.coordinates, self.q_tree), "v.": (run.coordinates, self.v_tree),
-                 "u.": (run.independent, self.u), "tau.": (run.actuated, self.tau)}  # fmt: skip
-        for prefix, (names, array) in parts.items():
-            curves |= {prefix + name: array[:, k] for k, name in enumerate(names)}
-        for name, array in self.points.items():
-            curves |= {f"point:{name}.{axis}": array[:, k] for k, axis in enumerate("xyz")}
-        return curves
+        return self[name, parameter]
 
     def summary(self) -> Summary:
         """Return the largest derivatives of independent coordinates and points, as `repr` and a notebook show them."""

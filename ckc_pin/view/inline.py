@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 from ckc_pin.errors import InputError
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
+from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.run.run import Run
 from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view.figures import draw_runs, write_figures
 from ckc_pin.view.gif import save_gif
 from ckc_pin.view.linear_figures import draw_linear
 from ckc_pin.view.player import render_html, write_page
-from ckc_pin.view.result_figures import draw_sensitivities
+from ckc_pin.view.result_figures import draw_motion_forces, draw_sensitivities
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +35,7 @@ class Figures(Mapping[str, "Figure"]):
 
     Parameters
     ----------
-    results : sequence of Run, or of one LinearModel, GainLocus or Sensitivities
+    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities or MotionForces
 
     Raises
     ------
@@ -42,13 +43,15 @@ class Figures(Mapping[str, "Figure"]):
         No result, another type, or a result that cannot be drawn together with others; matplotlib is not installed.
     """
 
-    def __init__(self, results: Sequence[Run | LinearModel | GainLocus | Sensitivities]) -> None:
+    def __init__(self, results: Sequence[Run | LinearModel | GainLocus | Sensitivities | MotionForces]) -> None:
         match results:
             case [LinearModel() | GainLocus() as result]:
                 self._figures = draw_linear(result)
             case [Sensitivities() as result]:
                 self._figures = {"sensitivities": draw_sensitivities(result)}
-            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities) for x in results):
+            case [MotionForces() as result]:
+                self._figures = {"inverse": draw_motion_forces(result)}
+            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities | MotionForces) for x in results):
                 raise InputError("plot: only runs can be drawn together; give each other result alone")
             case _:
                 self._figures = draw_runs(results)  # type: ignore[arg-type]

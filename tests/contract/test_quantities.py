@@ -16,6 +16,7 @@ from ckc_pin import InputError, Run, load, simulate
 from ckc_pin.run.columns import iterate_quantities
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
+from tests.contract.helpers.command import ckc
 
 Array = NDArray[np.float64]
 
@@ -232,3 +233,73 @@ def test_xarray_has_the_desired_motion(tracked: Run) -> None:
     assert np.array_equal(data["points.v"].sel(point="tip", axis="y"), tracked["tip.v.y"])
     assert data["error"].attrs["units"] == "rad"
     assert "desired" not in simulate("five_bar/swing", {"t_end": 0.01}).to_xarray()
+
+
+# --- inverse dynamics --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def forces() -> ckc_pin.MotionForces:
+    return ckc_pin.inverse_dynamics("five_bar/tracking", {"t_end": 0.2})
+
+
+def test_names_of_inverse_dynamics(forces: ckc_pin.MotionForces) -> None:
+    t = forces.t
+    assert_close(forces["theta_1"], AMPLITUDE_1 * np.sin(t), 1e-14)
+    assert_close(forces["v.theta_3"], AMPLITUDE_3 * np.sin(t), 1e-14)
+    assert_close(forces["a.theta_1"], -AMPLITUDE_1 * np.sin(t), 1e-14)
+    states = list(zip(forces.q_tree, forces.v_tree, forces.a_tree, forces.tau, strict=True))
+    for k, (q, v, a, tau) in enumerate(states):
+        solution = FIVE_BAR.acceleration_and_multipliers(q, v, tau)
+        assert_close(solution[0], a, 1e-9)
+        assert_close([forces["loop.elbow.x"][k], forces["loop.elbow.y"][k]], solution[1], 1e-10)
+        assert_close([forces["tau.theta_1"][k], forces["tau.theta_3"][k]], tau, 0.0)
+        assert_close(forces["energy.total"][k], FIVE_BAR.energy(q, v), 1e-12)
+    for k, component in enumerate(("fx", "fy", "fz", "mx", "my", "mz")):
+        assert np.array_equal(forces[f"joint.theta_4.{component}"], forces.joint_forces["theta_4"][:, k])
+    with pytest.raises(InputError, match=r"forces\['joint\.theta_5\.fx'\]: no such .* are 'joint\.theta_1\.fx'"):
+        forces["joint.theta_5.fx"]
+    with pytest.raises(InputError, match=r"forces\['u\.theta_1'\]: inverse dynamics has no such quantity"):
+        forces["u.theta_1"]
+
+
+def test_wrenches_along_a_run_are_those_of_inverse_dynamics(tracked: Run) -> None:
+    forces = ckc_pin.inverse_dynamics(tracked)
+    for name in ("loop.elbow.y", "joint.theta_3.fx", "joint.theta_1.mz", "a.theta_4"):
+        assert_close(tracked[name], forces[name], 1e-9)
+
+
+def test_tables_and_figure_of_inverse_dynamics(forces: ckc_pin.MotionForces, tmp_path: Path) -> None:
+    wrenches = [f"joint.{joint}.{x}" for joint in JOINTS for x in ("fx", "fy", "fz", "mx", "my", "mz")]
+    columns = [*JOINTS, *(f"v.{x}" for x in JOINTS), *(f"a.{x}" for x in JOINTS), "tau.theta_1", "tau.theta_3",
+               "loop.elbow.x", "loop.elbow.y", *wrenches]  # fmt: skip
+    assert list(forces.to_pandas().columns) == columns
+    with forces.to_csv(tmp_path / "forces.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["t", *columns]
+    values = np.array(rows, dtype=float)
+    assert np.array_equal(values, np.column_stack([forces.t, *(forces[name] for name in columns)]))
+    assert list(forces.to_pandas(["tip.v.x", "tau.theta_3"]).columns) == ["tip.v.x", "tau.theta_3"]
+    figures = forces.plot()
+    assert repr(figures) == "Figures(inverse)"
+    assert figures._repr_html_().count('<img src="data:image/png;base64,iVBOR') == 1
+    with pytest.raises(InputError, match="only runs can be drawn together"):
+        ckc_pin.plot(forces, forces)
+
+
+@pytest.mark.parametrize(("command", "column"), [("run", "error.theta_1"), ("inverse", "joint.theta_2.mz")])
+def test_commands_write_csv(command: str, column: str, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "table.csv"
+    arguments = (command, "five_bar/tracking", "--set", "t_end=0.1", "--csv", str(path))
+    answer = ckc(*arguments)
+    assert answer.code == 0
+    assert answer.out.endswith(f"written: {path}\n")
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    assert column in head.split(",")
+    assert [float(row.partition(",")[0]) for row in rows] == pytest.approx(np.arange(6) * 0.02)
+    path.unlink()
+    assert ckc(*arguments, "--json").json["status"] == "done"
+    assert path.is_file()
+    refused = ckc(*arguments[:-1], str(tmp_path))
+    assert (refused.code, refused.out) == (2, "")
+    assert refused.err == f"error: --csv {tmp_path}: expected the name of a file, got a folder\n"

@@ -88,5 +88,19 @@ def test_lengths_that_only_place_a_point_are_allowed_with_tracking(tmp_path: Pat
 def test_unknown_quantities_are_rejected(tmp_path: Path) -> None:
     result = ckc_pin.sensitivities("five_bar/swing", ["gravity.y"], {"t_end": 0.1})
     for name in ("tip", "point:tip", None):
-        with pytest.raises(InputError, match=r"there are theta_1, .*, point:tip\.x, point:tip\.y, point:tip\.z"):
+        with pytest.raises(
+            InputError, match=r"no such quantity; the nearest names are .*; there are the coordinates theta_1"
+        ):
             result.of(name, "gravity.y")  # type: ignore[arg-type]
+
+
+def test_derivatives_are_selected_by_name() -> None:
+    result = ckc_pin.sensitivities("five_bar/set_point", ["link.link_2.mass", "gravity.y"], {"t_end": 0.1})
+    assert np.array_equal(result["v.theta_2"], result.v_tree[:, 1])
+    assert np.array_equal(result["tau.theta_3", "gravity.y"], result.tau[:, 1, 1])
+    assert np.array_equal(result["tip.y", "gravity.y"], result.points["tip"][:, 1, 1])
+    assert np.array_equal(result.of("point:tip.y", "gravity.y"), result["tip.y", "gravity.y"])
+    with pytest.raises(InputError, match=r"sensitivities\['energy\.total'\]: this derivative is not computed"):
+        result["energy.total"]
+    with pytest.raises(InputError, match=r"no parameter 'gravity' among these; .*; did you mean 'gravity\.y'\?"):
+        result["theta_1", "gravity"]
