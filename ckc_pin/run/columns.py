@@ -110,10 +110,10 @@ def list_quantities(mechanism: Mechanism) -> dict[str, Quantity]:
 
 def unknown_quantity(where: str, name: Any, mechanism: Mechanism, arrays: Sequence[str] = ()) -> InputError:
     """Return the error for a name that no quantity has. It lists the nearest names, coordinates and arrays."""
-    near = find_near_names(name, [*list_quantities(mechanism), *arrays], NEAR_NAMES)
+    nearest = find_near_names(name, [*list_quantities(mechanism), *arrays], NEAR_NAMES)
     listed = ", ".join(mechanism.coordinates) + (f", and the arrays {', '.join(arrays)}" if arrays else "")
     return InputError(
-        f"{where}: no such quantity; the nearest names are {', '.join(map(repr, near))}; "
+        f"{where}: no such quantity; the nearest names are {', '.join(map(repr, nearest))}; "
         f"there are the coordinates {listed}; docs/reference/names.md has all names"
     )
 

@@ -404,10 +404,10 @@ class Run(HasSummary):
         merged = tuple(dict.fromkeys((*self.warnings, *warnings)))
         return self if merged == self.warnings else self._replace(warnings=merged)
 
-    def _replace(self, **changes: Any) -> Run:
+    def _replace(self, **attributes: Any) -> Run:
         """Return the run with other attributes, and with what it keeps of the simulation."""
         built: dict[str, Any] = {name: getattr(self, f"_{name}") for name in ("built_mechanism", "built_target")}
-        return replace(self, **built, **changes)
+        return replace(self, **built, **attributes)
 
     def loop_forces(self) -> dict[str, Array]:
         """Return the multipliers of eq. 1 along the run by loop, {name: (m, rows of the loop) array}, N or N m.

@@ -102,11 +102,11 @@ def test_desired_motion_and_errors(tracked: Run) -> None:
 
 
 def test_desired_motion_of_other_controllers(tmp_path: Path) -> None:
-    held = simulate("five_bar/set_point", {"t_end": 0.1})
-    q_d = [held.scene["controller"]["q_d"][name] for name in Q]
-    assert_close(held["desired.theta_3"], q_d[1], 0.0)
-    assert_close(held["desired.v.theta_3"], 0.0, 0.0)
-    assert_close(held["error.theta_1"], held["theta_1"] - q_d[0], 1e-15)
+    set_point = simulate("five_bar/set_point", {"t_end": 0.1})
+    q_d = [set_point.scene["controller"]["q_d"][name] for name in Q]
+    assert_close(set_point["desired.theta_3"], q_d[1], 0.0)
+    assert_close(set_point["desired.v.theta_3"], 0.0, 0.0)
+    assert_close(set_point["error.theta_1"], set_point["theta_1"] - q_d[0], 1e-15)
     free = simulate("five_bar/swing", {"t_end": 0.1})
     assert free.desired is None
     assert free.error is None
@@ -116,10 +116,10 @@ def test_desired_motion_of_other_controllers(tmp_path: Path) -> None:
     def desired(t: float) -> tuple[Array, Array, Array]:
         return np.array([t - 1.4, -1.7]), np.array([1.0, 0.0]), np.zeros(2)
 
-    own = simulate("five_bar/tracking", {"t_end": 0.1}, controller=ckc_pin.Tracking(np.eye(2), 10 * np.eye(2), desired))
-    part = own.sel(t=slice(0.04, 0.1))
+    run = simulate("five_bar/tracking", {"t_end": 0.1}, controller=ckc_pin.Tracking(np.eye(2), 10 * np.eye(2), desired))
+    part = run.sel(t=slice(0.04, 0.1))
     assert_close(part["error.theta_1"], part["theta_1"] - (part.t - 1.4), 1e-14)
-    assert Run.load(own.save(tmp_path / "run.npz")).desired is None, "a file does not contain a function"
+    assert Run.load(run.save(tmp_path / "run.npz")).desired is None, "a file does not contain a function"
 
 
 def test_points_and_their_velocities(tracked: Run) -> None:

@@ -13,7 +13,7 @@ from tests.conftest import assert_close
 
 SCENE = "five_bar/tracking"
 MASSES = [0.2, 0.3]
-SHORT: dict[str, Any] = {"t_end": 0.2, "solver.output_dt": 0.02, "solver.rtol": 1e-9}
+OVERRIDES: dict[str, Any] = {"t_end": 0.2, "solver.output_dt": 0.02, "solver.rtol": 1e-9}
 REDUCTIONS = {
     "end": lambda x: x[-1],
     "max_abs": lambda x: np.abs(x).max(),
@@ -27,7 +27,7 @@ DERIVED = ("desired.v.theta_1", "energy.kinetic", "tip.x", "tip.v.y", "a.theta_2
 
 @pytest.fixture(scope="module")
 def runs() -> list[Run]:
-    return [simulate(SCENE, SHORT | {"parameters": {"link.link_2.mass": mass}}) for mass in MASSES]
+    return [simulate(SCENE, OVERRIDES | {"parameters": {"link.link_2.mass": mass}}) for mass in MASSES]
 
 
 def _output(name: str, reduction: str) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def _output(name: str, reduction: str) -> dict[str, Any]:
 @pytest.mark.parametrize("names", [RECORDED, DERIVED], ids=["recorded", "derived"])
 def test_outputs_by_name_are_those_of_the_members_runs(names: tuple[str, ...], runs: list[Run]) -> None:
     outputs = {f"{reduction} of {name}": _output(name, reduction) for name in names for reduction in REDUCTIONS}
-    results = ckc_pin.ensemble(SCENE, {"link.link_2.mass": MASSES}, outputs, overrides=SHORT, progress=False)
+    results = ckc_pin.ensemble(SCENE, {"link.link_2.mass": MASSES}, outputs, overrides=OVERRIDES, progress=False)
     for name in names:
         for reduction, function in REDUCTIONS.items():
             expected = np.array([function(run[name]) for run in runs])
@@ -49,7 +49,7 @@ def test_outputs_by_name_are_those_of_the_members_runs(names: tuple[str, ...], r
 def test_trajectories_and_units_by_name(runs: list[Run]) -> None:
     outputs = {name: {"of": name, "reduce": "trajectory"} for name in ("tip.y", "tau.theta_3")}
     outputs["way"] = {"of": "tip.v.x", "reduce": "integral"}
-    results = ckc_pin.ensemble(SCENE, {"link.link_2.mass": MASSES}, outputs, overrides=SHORT, progress=False)
+    results = ckc_pin.ensemble(SCENE, {"link.link_2.mass": MASSES}, outputs, overrides=OVERRIDES, progress=False)
     assert results["tip.y"].dims == results["tau.theta_3"].dims == ("member", "time")
     assert_close(results["tip.y"].to_numpy()[1], runs[1]["tip.y"], 1e-9)
     assert_close(results["tau.theta_3"].to_numpy()[0], runs[0]["tau.theta_3"], 1e-7)
