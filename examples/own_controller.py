@@ -27,7 +27,7 @@ class ComputedTorque:
 def main():
     overrides = {"formulation": "reduced", "initial": {"at": "equilibrium"}, "t_end": 3.0}
     run = ckc_pin.simulate("five_bar/swing", overrides, controller=ComputedTorque())
-    q = run.q_tree[:, [run.column(name) for name in run.independent]]
+    q = run.q
     decay = (1 + RATE * run.t) * np.exp(-RATE * run.t)
     exact = TARGET + (q[0] - TARGET) * decay[:, np.newaxis]
     print(

@@ -118,7 +118,7 @@ class RunQuantities(DerivedQuantities):
     def _dynamics(self) -> tuple[Array, Array]:
         from ckc_pin.run.inverse import compute_recorded_dynamics  # which uses runs
 
-        return compute_recorded_dynamics(self._run, self._run.scene_name)
+        return compute_recorded_dynamics(self._run, "accelerations and loop forces of a run")
 
     @cached_property
     def joint_wrenches(self) -> Array:

@@ -154,7 +154,7 @@ def _scene_event_functions(spec: EventSpec, mechanism: Mechanism, where: str) ->
     coordinate, value = spec.coordinate, spec.value or 0.0
     if coordinate is None and mechanism.rank == 0:
         raise InputError(f"{where}: {mechanism.name} has no closed loop, so there is no {spec.of}")
-    quantity = spec.of if coordinate is None else coordinate if spec.of == "q" else f"{coordinate}'s rate"
+    quantity = spec.of if coordinate is None else coordinate if spec.of == "q" else f"v.{coordinate}"
     label = {"name": f"{quantity} = {value:g}", "of": spec.of, "coordinate": coordinate, "value": value}
     k = 0 if coordinate is None else mechanism.tree.index[coordinate]
     event = _core.Event(

@@ -65,10 +65,10 @@ def test_an_event_whose_value_an_impact_skips_occurs_at_the_impact(scene_of: Mak
         overrides = {"formulation": formulation, "event": events, "solver.max_step": max_step}
         for events_found in events_by_caller(scene, overrides, 2 * x / v, functions):
             hit = (pytest.approx(x / v, abs=1e-10), 1)
-            assert occurrences(events_found, f"x's rate = {value:g}") == [hit], "rising, once"
+            assert occurrences(events_found, f"v.x = {value:g}") == [hit], "rising, once"
             assert occurrences(events_found, "own") == [hit]
-            assert not occurrences(events_found, f"x's rate = {beyond:g}")
-            assert not occurrences(events_found, f"x's rate = {-beyond:g}")
+            assert not occurrences(events_found, f"v.x = {beyond:g}")
+            assert not occurrences(events_found, f"v.x = {-beyond:g}")
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -109,8 +109,8 @@ def test_an_impact_while_another_joint_begins_to_stick(scene_of: Make, formulati
         simulate(scene, overrides, events=functions).events,
         step_through(scene, overrides, 3.0, functions),
     ):
-        assert occurrences(events_found, "x's rate = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
-        assert occurrences(events_found, "y's rate = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
+        assert occurrences(events_found, "v.x = 0.2") == [(pytest.approx(1.0, abs=1e-10), 1)]
+        assert occurrences(events_found, "v.y = 0") == [(pytest.approx(1.0, abs=1e-10), -1)]
         assert occurrences(events_found, "own") == [(pytest.approx(1.0, abs=1e-10), 1)]
 
 
@@ -124,7 +124,7 @@ def test_a_bouncing_balls_rate_is_zero_at_each_impact_and_apex(scene_of: Make, f
     overrides = {"formulation": formulation, "event": [rate_event(0.0)], "solver.rtol": 1e-10}
     for events_found in events_by_caller(scene, overrides, 1.8, functions):
         bounces = sum(event["name"] == "x bounces" for event in events_found)
-        for name in ("own", "x's rate = 0"):
+        for name in ("own", "v.x = 0"):
             here = occurrences(events_found, name)
             assert [direction for _, direction in here] == [1, -1] * bounces + [1], (
                 "the last one is where contact begins"
@@ -144,7 +144,7 @@ def test_a_body_that_transfers_all_momentum_comes_to_rest_once(scene_of: Make) -
             overrides = {"formulation": formulation, "t_end": t_end, "event": [rate_event(0.0, joint="a")]}
             run = simulate(scene, overrides, events=functions)
             assert (
-                occurrences(run.events, "a's rate = 0")
+                occurrences(run.events, "v.a = 0")
                 == occurrences(run.events, "own")
                 == [(pytest.approx(1.0, abs=1e-10), -1)]
             )
@@ -160,7 +160,7 @@ def test_a_joint_that_stays_at_its_stop_comes_to_rest_once(scene_of: Make, formu
     scene = slider(scene_of, 1.0, -1.0, "stops = true\nrestitution = 0.0\n", t_end)
     events = [rate_event(0.0), rate_event(0.0, of="q"), rate_event(-0.5), {"of": "limit", "coordinate": "x"}]
     functions = [Event(lambda t, y: y.q_dot[0], name="rate"), Event(lambda t, y: y.q[0], name="place")]
-    once = {"x's rate = 0": 1, "x = 0": -1, "x's rate = -0.5": 1, "x at its lower limit": 1, "rate": 1, "place": -1}
+    once = {"v.x = 0": 1, "x = 0": -1, "v.x = -0.5": 1, "x at its lower limit": 1, "rate": 1, "place": -1}
     for events_found in events_by_caller(scene, {"formulation": formulation, "event": events}, t_end, functions):
         for name, direction in once.items():
             assert occurrences(events_found, name) == [(pytest.approx(1.0, abs=1e-10), direction)], name
@@ -178,7 +178,7 @@ def test_a_joint_that_sticks_comes_to_rest_once_and_moves_on(scene_of: Make, for
     simulator = Simulator(scene, {"formulation": formulation, "event": [rate_event(0.0)]}, events=functions)
     for push, dt in ((1.0, 1.0), (0.0, 1.7), (0.3, 1.3), (again, 1.0), (0.0, 3.0), (0.0, 2.0)):
         simulator.step([push], dt)
-    for name in ("own", "x's rate = 0"):
+    for name in ("own", "v.x = 0"):
         rests = [(pytest.approx(2.0, abs=1e-9), -1), (pytest.approx(6.0, abs=1e-9), -1 if again > 0 else 1)]
         assert occurrences(simulator.events, name) == rests
 
@@ -202,7 +202,7 @@ def test_joints_locked_by_sticking_joints_come_to_rest_once(rtol: float) -> None
         impact = next(event["t"] for event in run.events if event["name"] == "theta_1 bounces")
         rest = next(event["t"] for event in run.events if event["name"] == "theta_1 sticks")
         for name, directions in counts.items():
-            for called in (name, f"{name}'s rate = 0"):
+            for called in (name, f"v.{name} = 0"):
                 here = occurrences(run.events, called)
                 assert [direction for _, direction in here] == directions, called
                 if name != "theta_3":
@@ -222,7 +222,7 @@ def test_events_do_not_change_a_motion_with_sticking_and_impacts(formulation: st
     assert monitored.stats["rhs"] == plain.stats["rhs"]
     assert_close(monitored.q_tree, plain.q_tree, 1e-9)  # as closely as the loops close
     for name in names:
-        functions, of_scene = occurrences(monitored.events, name), occurrences(monitored.events, f"{name}'s rate = 0")
+        functions, of_scene = occurrences(monitored.events, name), occurrences(monitored.events, f"v.{name} = 0")
         assert [direction for _, direction in functions] == [direction for _, direction in of_scene]
         assert [t for t, _ in functions] == pytest.approx([t for t, _ in of_scene], abs=1e-8)
 
