@@ -167,7 +167,8 @@ class Members:
         self.mechanism = self.ready.mechanism
         self._vectors = check_variable_names(scene, self._overrides, self.scene, self.mechanism, names)
         self._output_specs = outputs
-        self.outputs = Outputs(outputs, self.ready)
+        self._has_fixed_mechanism = not any(is_parameter(name) for name in names)
+        self.outputs = Outputs(outputs, self.ready, has_fixed_mechanism=self._has_fixed_mechanism)
         self._require_equal_instants()
         self._parameters = [k for k, name in enumerate(names) if is_parameter(name)]
         parameters = ParameterMap(
@@ -339,7 +340,8 @@ class Members:
             return FAILED, str(error), 0
         if ended == "interrupted":
             raise interrupt_again(message)
-        member_outputs = Outputs(self._output_specs, ready)  # output instants and q_d may differ between members
+        # Output instants and q_d may differ between members.
+        member_outputs = Outputs(self._output_specs, ready, has_fixed_mechanism=self._has_fixed_mechanism)
         for name, value in member_outputs.compute(member_outputs.record(rows)).items():
             outputs[name][k] = value[0]
         rhs = ready.loop.stats().rhs

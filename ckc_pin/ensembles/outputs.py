@@ -14,7 +14,8 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.ensembles.spec import OutputSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.units import joined
-from ckc_pin.run.columns import integral_unit, list_quantities, quantity_units, unknown_quantity
+from ckc_pin.run.columns import Quantity, integral_unit, list_quantities, quantity_units, unknown_quantity
+from ckc_pin.run.derived import DerivedQuantities
 from ckc_pin.run.prepare import Prepared
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import record_columns
@@ -33,6 +34,8 @@ VECTORS = {"q_tree": "coordinate", "v_tree": "coordinate", "u": "independent", "
 SCALARS = ("energy", "dissipated", "lyapunov", "t")
 DERIVED = ("settled", "energy_drift")
 EVENT = "event."
+# Arrays of `DerivedQuantities`, which a mechanism determines from q' and v'.
+OF_STATE = ("point_positions", "point_velocities", "kinetic_energy", "potential_energy", "sigma_min")
 TIME_TOLERANCE = 1e-9  # of an instant after the end of a run, relative to the end
 COLUMNS_OF = {"phi_max": "max_phi"} | {name: name for name in ("q_tree", "v_tree", "u", "tau", "phi", "w", "energy")}
 
@@ -112,6 +115,8 @@ class Outputs:
     ----------
     specs : mapping of str to str, OutputSpec or callable
     ready : Prepared
+    has_fixed_mechanism : bool
+        Whether all members have the mechanism of `ready`. If so, points and energies follow from recorded rows.
 
     Raises
     ------
@@ -130,8 +135,11 @@ class Outputs:
         All other outputs.
     """
 
-    def __init__(self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared) -> None:
+    def __init__(
+        self, specs: Mapping[str, str | OutputSpec | Function], ready: Prepared, *, has_fixed_mechanism: bool = False
+    ) -> None:
         self._ready, self._slices = ready, record_columns(ready.loop)
+        self._has_fixed_mechanism = has_fixed_mechanism
         self._units, self._quantities = quantity_units(ready.mechanism), list_quantities(ready.mechanism)
         self.columns: list[int] = []
         self.functions: dict[str, Function] = {}
@@ -181,6 +189,8 @@ class Outputs:
         quantity = self._quantities.get(spec.of)
         if quantity is None or quantity.array in (*COLUMNS_OF, "error") or self._is_special(spec.of):
             return None
+        if self._has_fixed_mechanism and quantity.array in OF_STATE:
+            return None
         unit = integral_unit(quantity.unit) if spec.reduction == "integral" else quantity.unit
         return NamedQuantity(spec.of, unit, spec, self._ready.instants)
 
@@ -209,6 +219,9 @@ class Outputs:
         joints, smoothing = self._ready.mechanism.joints, self._ready.scene.spec.friction_smoothing
         if spec.of == "dissipated" and joints.has_smooth_friction(smoothing):
             return self._create_unknown(spec)
+        quantity = self._quantities.get(spec.of)
+        if quantity is not None and quantity.array in OF_STATE:
+            return self._create_function_of_state(spec, quantity)
         columns, dims, reference = self._find_columns(name, spec.of)
         shape = (len(columns),) if dims else ()
         units = self._units_of(spec)
@@ -224,6 +237,32 @@ class Outputs:
         if reduction == "trajectory":
             return Output((*dims, "time"), (*shape, len(self._ready.instants)), units, compute)
         return Output(dims, shape, units, compute)
+
+    def _create_function_of_state(self, spec: OutputSpec, quantity: Quantity) -> Output:
+        """Return the output of a quantity that the mechanism determines from q' and v', such as a point's position."""
+        mechanism, instants, n = self._ready.mechanism, self._ready.instants, self._ready.mechanism.n
+        columns = [k for name in ("q_tree", "v_tree") for k in range(self._slices[name].start, self._slices[name].stop)]
+
+        def evaluate(states: Array) -> Array:
+            """Return the quantity of states (k, 2 n); NaN where a member has none."""
+            values = np.full(len(states), np.nan)
+            is_recorded = np.isfinite(states).all(axis=1)
+            q_tree, v_tree = states[is_recorded, :n], states[is_recorded, n:]
+            derived = DerivedQuantities(np.zeros(len(q_tree)), q_tree, v_tree, mechanism)
+            values[is_recorded] = quantity.select(getattr(derived, quantity.array))
+            return values
+
+        if spec.reduction == "end":
+            return Output((), (), self._units_of(spec), lambda recorded: evaluate(recorded.last_row[:, columns]))
+        indices = self._require_series(columns)
+
+        def compute(recorded: Recorded) -> Array:
+            states = recorded.series[:, indices].transpose(0, 2, 1)
+            values = evaluate(states.reshape(-1, 2 * n)).reshape(len(states), 1, -1)
+            return _squeeze(_reduce(values, spec, instants), ())
+
+        dims, shape = (("time",), (len(instants),)) if spec.reduction == "trajectory" else ((), ())
+        return Output(dims, shape, self._units_of(spec), compute)
 
     def _create_unknown(self, spec: OutputSpec) -> Output:
         """Return an output of a scalar that is NaN, because a run does not compute it."""

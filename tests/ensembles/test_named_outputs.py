@@ -9,6 +9,8 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, Run, simulate
+from ckc_pin.ensembles.members import Members
+from ckc_pin.ensembles.spec import OutputSpec
 from tests.conftest import assert_close
 
 SCENE = "five_bar/tracking"
@@ -30,6 +32,10 @@ def runs() -> list[Run]:
     return [simulate(SCENE, OVERRIDES | {"parameters": {"link.link_2.mass": mass}}) for mass in MASSES]
 
 
+def _specs(outputs: dict[str, dict[str, Any]]) -> dict[str, OutputSpec]:
+    return {name: OutputSpec(**output) for name, output in outputs.items()}
+
+
 def _output(name: str, reduction: str) -> dict[str, Any]:
     return {"of": name, "at": 0.1} if reduction == "at" else {"of": name, "reduce": reduction}
 
@@ -44,6 +50,22 @@ def test_outputs_by_name_are_those_of_the_members_runs(names: tuple[str, ...], r
             size = np.abs(np.array([run[name] for run in runs])).max()
             assert_close(results[f"{reduction} of {name}"].to_numpy(), expected, 1e-8 * max(1.0, size))
     assert results["status"].to_numpy().tolist() == [1, 1]
+
+
+def test_points_and_energies_follow_from_rows_if_only_the_start_varies() -> None:
+    names = ("tip.x", "tip.v.y", "energy.kinetic", "energy.potential", "sigma_min")
+    outputs = {f"{reduction} of {name}": _output(name, reduction) for name in names for reduction in REDUCTIONS}
+    outputs["way"] = {"of": "tip.x", "reduce": "trajectory"}
+    rates = [0.5, 1.0]
+    members = Members("five_bar/swing", OVERRIDES, ("initial.q_dot.theta_1",), _specs(outputs), 2, 1)
+    assert members.is_batched
+    chunk = members.run(0, np.array(rates)[:, None])
+    runs = [simulate("five_bar/swing", OVERRIDES | {"initial.q_dot.theta_1": rate}) for rate in rates]
+    for name in names:
+        for reduction, function in REDUCTIONS.items():
+            assert_close(chunk.outputs[f"{reduction} of {name}"], [function(run[name]) for run in runs], 1e-7)
+    assert_close(chunk.outputs["way"], [run["tip.x"] for run in runs], 1e-7)
+    assert members.units["max_abs of tip.v.y"] == ("m/s",)
 
 
 def test_trajectories_and_units_by_name(runs: list[Run]) -> None:
