@@ -141,6 +141,7 @@ def _write_csv(finished: ckc_pin.Run, csv: Path | None, as_json: bool) -> None:
         finished.to_csv(csv)
     if not as_json:
         print_written([csv])
+    sys.stdout.flush()  # A live view may keep the command running.
 
 
 def _require_meshcat_for_view_options(meshcat: bool, speed: float | None, port: int, open_browser: bool) -> None:

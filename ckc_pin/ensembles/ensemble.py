@@ -122,9 +122,10 @@ def ensemble(
         logarithm; ``{"grid": {"start": a, "stop": b, "count": n}}``; a list of values; ``{"file": "x.csv"}``. Grids,
         lists and files are crossed.
     outputs : mapping
-        Quantities to keep, by names of your choice: "q_tree" and others at the end of a run;
-        ``{"of": "theta_1", "reduce": "max_abs"}``; or a function of a `Run` that returns a number, or an array whose
-        shape is the same for all members.
+        Quantities to keep, by names of your choice. A string stands for the value at the end of a run: "q_tree", or any
+        name that ``run[name]`` takes, as "tau.theta_1" or "tip.x". ``{"of": "theta_1", "reduce": "max_abs"}`` reduces
+        it over time and ``{"of": "theta_1", "at": 0.5}`` is its value at a time, s. Or a function of a `Run` that
+        returns a number, or an array whose shape is the same for all members.
     members : int, optional
         Number of members, at each point of the crossed variables. Needed if a variable is random.
     seed : int
