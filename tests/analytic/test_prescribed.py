@@ -197,6 +197,12 @@ def test_motor_of_a_prescribed_joint_does_the_work_that_the_energy_takes(name: s
     assert_close(dae.q_tree, reduced.q_tree, 1e-9)
 
 
+def test_scene_with_a_start_of_the_prescribed_joint_runs() -> None:
+    run = simulate("slider_crank", {"prescribed": [{"joint": "crank", "rate": 5.0}], "t_end": 1.0})
+    assert_close(run["crank"], 5.0 * run.t, 1e-12)
+    assert_close(run["v.crank"], 5.0, 1e-12)
+
+
 def test_saved_run_keeps_the_prescribed_joint(tmp_path: Path) -> None:
     run = simulate("five_bar/swing", scene("reduced", t_end=0.2))
     loaded = Run.load(run.save(tmp_path / "run.npz"))
