@@ -37,18 +37,60 @@ def assemble_mechanism(
     MechanismError
         Unknown names, loops that cannot be closed from q_guess, or unsuitable independent coordinates.
     """
-    linkage = Linkage(spec, sources, overrides, prescribed)
+    linkage = Linkage(spec, sources, overrides)
     tree = linkage.tree
     with one_blas_thread():
-        guess = tree.vector({**spec.q_guess, **(prescribed or {})}, tree.coordinates, "q_guess", fill=0.0)
+        guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)
         guess = _apply_couplings(linkage, guess)
         mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess)))
         if linkage.spec.independent is None:
             mechanism = _restore_guess(linkage, mechanism)
-        if locking := describe_locking_loops(mechanism):
+        if prescribed:
+            with_rows = Linkage(spec, sources, overrides, prescribed)
+            mechanism = _prescribe(with_rows, linkage, mechanism, prescribed)
+        elif locking := describe_locking_loops(mechanism):
             mechanism.warnings.append(f"the loops leave no freedom (d = 0): {locking}")
         mechanism.warnings += find_model_warnings(mechanism)
         return mechanism
+
+
+def _prescribe(linkage: Linkage, free_linkage: Linkage, free: Mechanism, prescribed: Mapping[str, float]) -> Mechanism:
+    """Create a mechanism with prescribed joints, on the branch of the mechanism without them.
+
+    Parameters
+    ----------
+    linkage : Linkage
+        With the rows of the prescribed joints.
+    free_linkage, free : Linkage, Mechanism
+        Without them, as assembled.
+    prescribed : mapping of str to float
+        Positions of the joints, rad or m.
+
+    Raises
+    ------
+    MechanismError
+        The loops cannot be closed with these positions.
+    """
+    tree, q_tree = linkage.tree, free.q_tree
+    at = tree.indices(tuple(prescribed), "prescribed")
+    independent = free.complete_independent(tuple(prescribed))
+    reached = False
+    if independent is not None:
+        base = _create_mechanism(free_linkage, Assembly(free.q_tree, free.residual, {}), independent)
+        numbers = tree.to_coordinates(free.q_tree)
+        q = np.array([prescribed.get(name, numbers[tree.index[name]]) for name in base.independent])
+        moved = sigma(base, q, anywhere=False)
+        reached = moved.verdict == "converged"
+        q_tree = moved.at.q_tree if reached else q_tree
+    numbers = tree.to_coordinates(q_tree)
+    numbers[at] = list(prescribed.values())
+    mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(numbers)))
+    if not reached:
+        positions = ", ".join(f"{name} = {value:.6g}" for name, value in prescribed.items())
+        mechanism.warnings.append(
+            f"prescribed: {positions} is not reached from q_guess on its branch; the mechanism may be on another one"
+        )
+    return mechanism
 
 
 def _create_mechanism(linkage: Linkage, closed: Assembly, independent: tuple[str, ...] | None = None) -> Mechanism:

@@ -254,8 +254,16 @@ class Mechanism(HasSummary):
         ]  # in tau's order
         return self._prefer(driven, best)
 
+    def complete_independent(self, names: Sequence[str]) -> tuple[str, ...] | None:
+        """Return independent coordinates that contain these; None if the loops couple them where it is assembled."""
+        others = np.setdiff1d(np.arange(self.n), self.tree.indices(tuple(names), "independent"))
+        jacobian = self.freedoms.jacobian[:, others]
+        dependent = choose_dependent(jacobian, self.rank) if compute_rank(jacobian).rank == self.rank else None
+        if dependent is None:
+            return None
+        return (*names, *(self.coordinates[k] for i, k in enumerate(others) if i not in dependent))
+
     def _prefer(self, preferred: IntArray, best: list[str]) -> list[str]:
-        """Return independent coordinates: preferred ones as far as phi_z stays well conditioned, then others."""
         blocks = [np.arange(v, v + 6) for _, v in self.tree.free_roots]
         z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, preferred)
         if z is None:

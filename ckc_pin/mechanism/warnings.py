@@ -34,7 +34,7 @@ def find_model_warnings(mechanism: Mechanism) -> list[str]:
             ends = [mechanism.frames.find(frame, f"spring {k + 1}").joint for frame in (spring.frame_a, spring.frame_b)]
             if ends[0] == ends[1]:
                 warnings.append(f"spring {k + 1} does nothing: its frames belong to the same rigid body")
-    if distant := _far_from_guess(mechanism):
+    if not mechanism.prescribed and (distant := _far_from_guess(mechanism)):
         warnings.append(
             f"assembled more than {FAR_FROM_GUESS:g} rad, or {FAR_FROM_GUESS:g} of the size {mechanism.size:.3g} m, "
             f"from q_guess: {', '.join(distant)}"

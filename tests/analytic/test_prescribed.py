@@ -201,6 +201,10 @@ def test_scene_with_a_start_of_the_prescribed_joint_runs() -> None:
     run = simulate("slider_crank", {"prescribed": [{"joint": "crank", "rate": 5.0}], "t_end": 1.0})
     assert_close(run["crank"], 5.0 * run.t, 1e-12)
     assert_close(run["v.crank"], 5.0, 1e-12)
+    assert_close(
+        run["slider"], CRANK * np.cos(5.0 * run.t) + np.sqrt(ROD**2 - (CRANK * np.sin(5.0 * run.t)) ** 2), 1e-11
+    )
+    assert run.warnings == ()
 
 
 def test_saved_run_keeps_the_prescribed_joint(tmp_path: Path) -> None:
