@@ -26,7 +26,7 @@ from tests.ensembles.test_sweep import open_results, write_sweep
 
 def test_ctrl_c_keeps_finished_members(tmp_path: Path) -> None:
     path, out = write_sweep(tmp_path, members=2000, t_end=2.0), tmp_path / "o"
-    command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--chunk", "5", "--json"]
+    command = [sys.executable, "-m", "ckc_pin", "sweep", str(path), "--out", str(out), "--chunk", "5", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while len(list(out.glob("results.zarr/status/c/*"))) < 2 and process.poll() is None:

@@ -89,7 +89,7 @@ def test_a_killed_sweep_is_resumed(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "ckc_pin.cli",
+        "ckc_pin",
         "sweep",
         str(path),
         "--out",
@@ -123,7 +123,7 @@ def test_a_killed_sweep_is_resumed(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_reported_and_the_store_remains_valid(tmp_path: Path) -> None:
     path, out = write_sweep(tmp_path, members=4000, t_end=0.02), tmp_path / "o"
-    command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--chunk", "2000", "--json"]
+    command = [sys.executable, "-m", "ckc_pin", "sweep", str(path), "--out", str(out), "--chunk", "2000", "--json"]
 
     def limit_file_size() -> None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -144,7 +144,7 @@ def test_a_store_that_could_not_be_created_leaves_no_files(tmp_path: Path) -> No
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, 3_000))
 
-    command = [sys.executable, "-m", "ckc_pin.cli", "sweep", str(path), "--out", str(out), "--json"]
+    command = [sys.executable, "-m", "ckc_pin", "sweep", str(path), "--out", str(out), "--json"]
     process = subprocess.run(command, preexec_fn=limit_file_size, capture_output=True, text=True, check=False)
     assert process.returncode == 2
     assert process.stderr.splitlines() == [f"error: {out / 'results.zarr'}: cannot be written: File too large"]
@@ -258,7 +258,7 @@ def test_finished_chunks_are_kept_if_the_scheduler_is_lost(tmp_path: Path) -> No
         path = write_sweep(tmp_path, members=2000, t_end=2.0)
         options = ["--out", str(out), "--chunk", "5", "--no-figures", "--json", "--scheduler", address]
         ends: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        processes.append(subprocess.Popen([*python, "ckc_pin.cli", "sweep", str(path), *options], **ends))
+        processes.append(subprocess.Popen([*python, "ckc_pin", "sweep", str(path), *options], **ends))
         wait_for(lambda: len(list(out.glob("results.zarr/status/c/*"))) > 1)
         processes[0].kill()
         printed, errors = processes[2].communicate(timeout=120)

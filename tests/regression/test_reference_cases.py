@@ -21,7 +21,7 @@ FORMULATIONS = ("dae", "reduced", "spf")
 def command(*words: str) -> dict[str, Any]:
     """The JSON of `ckc run`, called as a separate program."""
     done = subprocess.run(
-        [sys.executable, "-m", "ckc_pin.cli", "run", *words, "--json"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "ckc_pin", "run", *words, "--json"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     summary: dict[str, Any] = json.loads(done.stdout)

@@ -140,7 +140,7 @@ def _plot(runs: Sequence[Run], figures: Path) -> list[str]:
     """Draw runs by ``ckc plot``, as a reader would."""
     with tempfile.TemporaryDirectory() as folder:
         saved = [str(run.save(Path(folder) / f"{k}.npz")) for k, run in enumerate(runs)]
-        command = [sys.executable, "-m", "ckc_pin.cli", "plot", *saved, "--out", str(figures)]
+        command = [sys.executable, "-m", "ckc_pin", "plot", *saved, "--out", str(figures)]
         written = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return [Path(line).name for line in written.splitlines()]
 

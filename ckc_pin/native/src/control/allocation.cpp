@@ -27,7 +27,8 @@ Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector 
   for (Vector* x : {&residual_, &row_scale_, &multiplier_, &direction_, &coefficients_}) x->setZero(d);
   for (Vector* x : {&unlimited_, &unclamped_, &tau_direction_, &becomes_free_, &becomes_limited_}) x->setZero(motors);
   breakpoints_.setZero(2 * motors);
-  if (d) eigen_.compute(Matrix::Identity(d, d));  // A solver that has computed nothing cannot be moved, so use it once.
+  // A solver that has computed nothing cannot be moved, so use it once.
+  eigen_.compute(Matrix::Identity(std::max(d, 1), std::max(d, 1)));
 }
 
 void Allocation::allocate(const Matrix& transmission, In u, Out tau) {
