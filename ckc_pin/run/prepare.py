@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,7 +32,7 @@ from ckc_pin.native import _core
 from ckc_pin.native.control import control_table, prescribed_table
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
-from ckc_pin.run.checks import require_runnable
+from ckc_pin.run.checks import require_runnable, start_warnings
 from ckc_pin.run.compiled_terms import NEVER, select_library
 from ckc_pin.run.events import Event, EventFunction, build_event_functions
 from ckc_pin.run.loop_terms import wrap_controller
@@ -139,6 +139,11 @@ class Prepared:
     def missing_arguments(self) -> dict[str, BoolArray] | None:
         """Arguments that a library of compiled terms needs for the parameter derivatives, if there is none yet."""
         return self.sensitivities.missing_arguments if self.sensitivities else None
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings of the mechanism and the start, which are known without following the desired motion."""
+        return (*self.mechanism.warnings, *start_warnings(self.scene, self.mechanism, self.start))
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Set the loop to a start at time t (s), by default the scene's, and discard its history.

@@ -24,7 +24,7 @@ from ckc_pin.run.loop_terms import require_number
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
-from ckc_pin.run.stop_reasons import PAUSE_S, add_cause, describe_stop, find_exit, known_warnings
+from ckc_pin.run.stop_reasons import PAUSE_S, add_cause, describe_stop, find_exit
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
@@ -93,7 +93,7 @@ def simulate(
 def run_prepared(prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
     """Run a prepared scene from its start; errors as of `simulate`."""
     started = perf_counter()  # Loading and assembling do not count as time of the run.
-    warnings = known_warnings(prepared)
+    warnings = list(prepared.warnings)
     rows, status, message = record_rows(prepared, progress, on_output, warnings)
     wall_s = perf_counter() - started
     return build_run(prepared, rows, status=status, message=message, wall_s=wall_s, warnings=warnings)

@@ -13,12 +13,12 @@ from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import Loop, RhsFailure, Stop, StopReason
-from ckc_pin.run.checks import desired_warnings, start_warnings
+from ckc_pin.run.checks import desired_warnings
 from ckc_pin.run.events import EventFunction
 from ckc_pin.run.prepare import Prepared
 from ckc_pin.scene.spec import SolverSpec
 
-__all__ = ["PAUSE_S", "add_cause", "describe_stop", "find_exit", "known_warnings"]
+__all__ = ["PAUSE_S", "add_cause", "describe_stop", "find_exit"]
 
 PAUSE_S = 0.05  # longest time that the native loop keeps the interpreter, and with it Ctrl-C, waiting, s
 SAME_INSTANT_TOLERANCE = 1e-8  # mode transitions closer in time are at one instant; relative to t, or s
@@ -179,11 +179,6 @@ def _describe_impossible_motion(mechanism: Mechanism) -> str:
 
 
 # --- causes and warnings ---------------------------------------------------------------------------
-
-
-def known_warnings(prepared: Prepared) -> list[str]:
-    """Return the warnings of a scene's mechanism and start, which are known without following the desired motion."""
-    return [*prepared.mechanism.warnings, *start_warnings(prepared.scene, prepared.mechanism, prepared.start)]
 
 
 def find_exit(prepared: Prepared, t: float) -> DesiredCheck | None:
