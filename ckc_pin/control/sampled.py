@@ -20,11 +20,18 @@ from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Sampled"]
+__all__ = ["Sampled", "unwrap_sampled"]
 
 MAX_SAMPLES = 10_000_000  # in a run
 
 T = TypeVar("T", bound=msgspec.Struct)
+
+
+def unwrap_sampled(
+    controller: Controller | TorqueController | Sampled | None,
+) -> Controller | TorqueController | None:
+    """Return the controller that a `Sampled` evaluates, or the controller itself if it is not sampled."""
+    return controller.controller if isinstance(controller, Sampled) else controller
 
 
 class Sampled:

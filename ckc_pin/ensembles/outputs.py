@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.controllers import SetPoint, Tracking
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import unwrap_sampled
 from ckc_pin.ensembles.spec import OutputSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.units import joined
@@ -342,7 +342,7 @@ class Outputs:
 
 
 def _find_law(ready: Prepared) -> Any:
-    return ready.controller.controller if isinstance(ready.controller, Sampled) else ready.controller
+    return unwrap_sampled(ready.controller)
 
 
 def _squeeze(x: Array, dims: tuple[str, ...]) -> Array:

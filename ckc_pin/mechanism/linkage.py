@@ -47,8 +47,6 @@ class Linkage:
     urdf : UrdfTree
         All trees of the file, merged into one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
-    closed : Closure
-        The rows of loops and couplings, without those of prescribed joints.
     prescribed : tuple of str
         Names of the prescribed joints.
     motors : Motors or None
@@ -87,11 +85,10 @@ class Linkage:
         self.couplings = (*spec.coupling, *mimic)
         for coupling in self.couplings:
             builder.add_coupling(coupling)
-        self.closed: Closure = builder.build()
         for joint, value in (prescribed or {}).items():
             builder.add_prescribed(joint, value)
         self.prescribed = tuple(prescribed or ())
-        self.closure: Closure = builder.build() if prescribed else self.closed
+        self.closure: Closure = builder.build()
         self.joints = Joints(self.tree, spec.joint)
         self.motors = motors_of(spec, self.tree)
         self.springs = Springs(self.tree, self.frames, spec.spring, spec.force)

@@ -11,6 +11,7 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
@@ -60,6 +61,10 @@ class Mechanism(HasSummary):
     joints, springs : Joints, Springs
     couplings : tuple of CouplingSpec
         Of the mechanism file, then those of the URDFs' mimic joints.
+    prescribed : tuple of str
+        Joints whose motion is prescribed.
+    prescribed_at, prescribed_rows : int array, list of int
+        Their coordinates, and their constraint rows.
     urdf : Element
         All trees merged into one <robot>, as Pinocchio read it.
     partition : Partition
@@ -93,6 +98,8 @@ class Mechanism(HasSummary):
         self.freedoms = freedoms
         self.d, self.rank = freedoms.d, freedoms.rank.rank
         self.prescribed = linkage.prescribed
+        self.prescribed_at = self.tree.indices(self.prescribed, "prescribed")
+        self.prescribed_rows = [self.closure.names.index((name, PRESCRIBED_ROW)) for name in self.prescribed]
         self.redundant = tuple(".".join(name) for name in freedoms.redundant)
         self.warnings = [*linkage.warnings, *freedoms.warnings]
         self._drop_ineffective_friction()

@@ -29,7 +29,6 @@ from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import DriveSpec, SensorSpec
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.tables import closure_table, core_table, packed
@@ -147,10 +146,10 @@ def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
 
 def prescribed_table(mechanism: Mechanism, motion: Desired, *, smooth_friction: bool) -> dict[str, Any]:
     """Return the table of the prescribed joints of a mechanism: their rows, motors, dry friction and motion."""
-    at = mechanism.tree.indices(mechanism.prescribed, "prescribed")
+    at = mechanism.prescribed_at
     motors = [motor for k in at if (motor := mechanism.motors.motor_on(k)) is not None]
     return {
-        "rows": [mechanism.closure.names.index((name, PRESCRIBED_ROW)) for name in mechanism.prescribed],
+        "rows": mechanism.prescribed_rows,
         "motors": motors,
         "offset": motion(0.0)[0],
         "gear": mechanism.motors.transmission[np.array(motors, np.intp), at],

@@ -97,7 +97,7 @@ def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
     joints, n = mechanism.joints, mechanism.n
     if mechanism.prescribed and not smoothing:  # `prescribed_table` has their friction
         prescribed = np.zeros(n, dtype=bool)
-        prescribed[mechanism.tree.indices(mechanism.prescribed, "prescribed")] = True
+        prescribed[mechanism.prescribed_at] = True
         joints = joints.without(prescribed)
     moves = smoothing is not None
     return {

@@ -14,7 +14,7 @@ from ckc_pin.control.controllers import (
     Tracking,
     is_torque_controller,
 )
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.control.spec import SetPointSpec
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.dynamics.formulations import require_mass
@@ -76,7 +76,7 @@ def require_runnable(
             raise InputError(f"initial: {beyond}; give another initial.q, or a q_guess within the stops")
     if mechanism.d:
         require_mass(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
-    law = controller.controller if isinstance(controller, Sampled) else controller
+    law = unwrap_sampled(controller)
     if law is not None and not is_torque_controller(law):
         require_chart(mechanism, start)
         actuation.require_driven_freedoms(start.at)
@@ -93,7 +93,7 @@ def _require_prescribable(
             f'prescribed: {names}: the SPF needs spf_coordinates = "w" and coriolis_velocity = "rho" with prescribed '
             "joints"
         )
-    law = controller.controller if isinstance(controller, Sampled) else controller
+    law = unwrap_sampled(controller)
     if isinstance(law, SetPoint | Tracking):
         raise InputError(
             f"prescribed: {names}: the controllers of eqs. 14 and 16 assume loops that do not move by themselves; use "
@@ -102,26 +102,22 @@ def _require_prescribable(
     if isinstance(controller, Sampled) and controller.sensor is not None:
         raise InputError(f"prescribed: {names}: sensors are not supported with prescribed joints; remove the sensor")
     joints = mechanism.joints
-    limited = np.isfinite(joints.lower) | np.isfinite(joints.upper)
     sticks = joints.has_events(spec.friction_smoothing) & (joints.stopped | (joints.friction != 0.0))
     driven = mechanism.freedoms.immobile.copy()
-    driven[mechanism.tree.indices(mechanism.prescribed, "prescribed")] = False
+    driven[mechanism.prescribed_at] = False
     if (sticks & driven).any():
         k = int(np.flatnonzero(sticks & driven)[0])
         raise InputError(
             f"prescribed: {names}: {mechanism.coordinates[k]} moves with it alone, so its dry friction and stops "
             "cannot hold it; give friction_smoothing, or remove its friction and stops"
         )
-    at = mechanism.tree.indices(mechanism.prescribed, "prescribed")
     motion, times = prescribed_motion(spec.prescribed), np.linspace(0.0, spec.t_end, PRESCRIBED_SAMPLES)
     positions = np.array([motion(t)[0] for t in times])
-    for k, name in zip(at, mechanism.prescribed, strict=True):
-        values = positions[:, mechanism.prescribed.index(name)]
-        beyond = (values < joints.lower[k]) | (values > joints.upper[k])
-        if limited[k] and joints.stopped[k] and beyond.any():
-            t = float(times[np.argmax(beyond)])
+    for k, name, values in zip(mechanism.prescribed_at, mechanism.prescribed, positions.T, strict=True):
+        beyond = np.flatnonzero((values < joints.lower[k]) | (values > joints.upper[k]))
+        if len(beyond):
             raise InputError(
-                f"prescribed: {name} = {float(values[np.argmax(beyond)]):.6g} at t = {t:.6g} s is beyond its stop; its "
+                f"prescribed: {name} = {values[beyond[0]]:.6g} at t = {times[beyond[0]]:.6g} s is beyond its stop; its "
                 f"range is {joints.lower[k]:g} to {joints.upper[k]:g}"
             )
 

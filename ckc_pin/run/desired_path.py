@@ -14,7 +14,7 @@ from ckc_pin.base.toml import convert
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import unwrap_sampled
 from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
 from ckc_pin.errors import NumericalError
 
@@ -69,7 +69,7 @@ def compute_desired_path(run: Run) -> DesiredPath | None:
 
 def find_target(controller: Any) -> Desired | Array | None:
     """Return the desired motion of a `Tracking`, or q_d of a `SetPoint`, also of a sampled one; None of others."""
-    law = controller.controller if isinstance(controller, Sampled) else controller
+    law = unwrap_sampled(controller)
     if isinstance(law, Tracking):
         return law.desired
     return law.q_d if isinstance(law, SetPoint) else None

@@ -131,7 +131,7 @@ def inverse_dynamics(
             mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end
             mechanism.refuse_prescribed_joints("inverse_dynamics")
             actuation = build_scene_actuation(scene, mechanism)
-            motion = _prescribed_motion(scene, mechanism, actuation)
+            motion = _desired_motion(scene, mechanism, actuation)
         return _collect_motion(motion, mechanism, actuation, scene.name, t_end, progress)
 
 
@@ -216,7 +216,7 @@ def _require_actuated(mechanism: Mechanism, tangent: Array, t: float) -> None:
 # --- motions -------------------------------------------------------------------------------------
 
 
-def _prescribed_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
     """Yield the desired motion of a scene's controller, with v' = rho q_dot and its rate rho q_ddot + rho_dot q_dot."""
     controller = build_scene_controller(scene, mechanism)
     if controller is None or isinstance(controller, RecordedTorques):

@@ -24,7 +24,8 @@ from ckc_pin.control.controllers import (
     as_controller,
     require_no_memory,
 )
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.desired import Desired
+from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -145,6 +146,10 @@ class Prepared:
         """Warnings of the mechanism and the start, which are known without following the desired motion."""
         return (*self.mechanism.warnings, *start_warnings(self.scene, self.mechanism, self.start))
 
+    @cached_property
+    def _prescribed_motion(self) -> Desired:
+        return prescribed_motion(self.scene.spec.prescribed)
+
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Set the loop to a start at time t (s), by default the scene's, and discard its history.
 
@@ -159,13 +164,12 @@ class Prepared:
         with np.errstate(over="ignore"):
             v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         if self.mechanism.prescribed and start.v_tree is None:
-            rates = prescribed_motion(self.scene.spec.prescribed)(t)[1]
-            v_tree = v_tree + prescribed_velocity(self.mechanism, start.at, rates)
+            v_tree = v_tree + prescribed_velocity(self.mechanism, start.at, self._prescribed_motion(t)[1])
         if not np.all(np.isfinite(v_tree)):
             raise InputError(
                 f"initial.q_dot = {start.q_dot.tolist()}: the rates of the dependent coordinates are not finite"
             )
-        law = self.controller.controller if isinstance(self.controller, Sampled) else self.controller
+        law = unwrap_sampled(self.controller)
         reset = getattr(law, "reset", None)
         if callable(reset):
             reset()

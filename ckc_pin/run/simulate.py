@@ -13,7 +13,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.validation import require_callable, require_flag
 from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.native import Loop, StopReason
@@ -237,7 +237,7 @@ def _evaluate_lyapunov(prepared: Prepared, recorded: Array, parts: dict[str, Arr
 
     The native loop records it for the controllers of scenes. A caller's function is evaluated here.
     """
-    law = prepared.controller.controller if isinstance(prepared.controller, Sampled) else prepared.controller
+    law = unwrap_sampled(prepared.controller)
     function = getattr(law, "lyapunov", None)
     if function is None:
         return None

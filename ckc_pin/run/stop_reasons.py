@@ -8,7 +8,7 @@ import numpy as np
 
 from ckc_pin.control.controllers import Tracking
 from ckc_pin.control.point_path import Circle, Line, PointPath
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import unwrap_sampled
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -183,7 +183,7 @@ def _describe_impossible_motion(mechanism: Mechanism) -> str:
 
 def find_exit(prepared: Prepared, t: float) -> DesiredCheck | None:
     """Return when the desired motion of a tracking controller left the workspace until a stop at t (s); None if not."""
-    law = prepared.controller.controller if isinstance(prepared.controller, Sampled) else prepared.controller
+    law = unwrap_sampled(prepared.controller)
     if not isinstance(law, Tracking):
         return None
     t_end = prepared.scene.spec.t_end
@@ -218,7 +218,7 @@ def add_cause(error: NumericalError, prepared: Prepared, exit_: DesiredCheck | N
 
 
 def _name_desired(prepared: Prepared) -> str:
-    law = prepared.controller.controller if isinstance(prepared.controller, Sampled) else prepared.controller
+    law = unwrap_sampled(prepared.controller)
     desired = getattr(law, "desired", None)
     if not isinstance(desired, PointPath):
         return "the desired motion"

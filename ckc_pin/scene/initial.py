@@ -11,7 +11,6 @@ from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import newton, sigma
-from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
@@ -121,8 +120,7 @@ def _close_full_configuration(mechanism: Mechanism, values: dict[str, float]) ->
 def prescribed_velocity(mechanism: Mechanism, at: Kinematics, rates: Array) -> Array:
     """Return the velocity of the tree that makes the prescribed joints move at these rates, with q_dot = 0, (n,)."""
     row_rates, v_tree = np.zeros(mechanism.closure.rows), np.zeros(mechanism.n)
-    for name, rate in zip(mechanism.prescribed, rates, strict=True):
-        row_rates[mechanism.closure.names.index((name, PRESCRIBED_ROW))] = rate
+    row_rates[mechanism.prescribed_rows] = rates
     v_tree[at.partition.z] = np.linalg.lstsq(at.phi_z, row_rates, rcond=None)[0]
     return v_tree
 

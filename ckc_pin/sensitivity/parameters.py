@@ -24,7 +24,7 @@ from ckc_pin.control.controllers import (
     is_torque_controller,
 )
 from ckc_pin.control.point_path import PointPath
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
@@ -71,7 +71,7 @@ def sensitivity_setup(names: Sequence[str]) -> SetUpSensitivities:
         start: Start,
     ) -> SensitivitySetup:
         overrides, rebuild = scene.spec.parameters, partial(rebuild_scene_mechanism, scene)
-        law = controller.controller if isinstance(controller, Sampled) else controller
+        law = unwrap_sampled(controller)
         parameters = find_sensitivity_parameters(mechanism, scene, law, actuation, names, rebuild, start.at.q_tree)
         require_supported_scene(mechanism, scene, controller, parameters)
         require_movable(mechanism, overrides, parameters, rebuild)

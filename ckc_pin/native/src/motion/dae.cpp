@@ -116,7 +116,8 @@ bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
-  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized() || core.has_row_motion())
+  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized() ||
+      core.has_row_motion())
     set_core_configuration(y), core.set_velocity(v);
   if (!compute_forces(t, q_tree_, v)) return false;
   residual_ = row_correction_;

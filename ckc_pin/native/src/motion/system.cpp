@@ -62,7 +62,8 @@ bool System::set_prescribed_torques(double t, Out tau) {
 }
 
 bool System::rhs(double t, In y, Out y_dot) {
-  return set_time(t) && motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) && (!integrand || integrand->rates(y, y_dot));
+  return set_time(t) && motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) &&
+         (!integrand || integrand->rates(y, y_dot));
 }
 
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {

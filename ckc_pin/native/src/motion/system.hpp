@@ -39,8 +39,8 @@ enum class Accepted {
   rejected,   // the coordinates are singular here
 };
 
-// Joints whose motion is prescribed: each is a constraint row, joint - trajectory(t) = 0, whose multiplier is the torque
-// of the motor on that joint.
+// Joints whose motion is prescribed. Each is a constraint row, joint - trajectory(t) = 0, and its multiplier is the
+// torque of the motor on that joint.
 struct PrescribedJoints {
   Indices rows, motors;
   Vector offset;    // of the rows: value of the trajectory at which their residual is zero
@@ -61,8 +61,8 @@ class System {
   // Replace the torques of the motors on prescribed joints by those that make them move as prescribed, at the core's
   // state with its control. False if there is no acceleration.
   bool set_prescribed_torques(double t, Out tau);
-  // Evaluate the prescribed motion of rows at t. Every function below that takes a time calls it. False, with a reason in
-  // `control.failure`, if it is undefined.
+  // Evaluate the prescribed motion of rows at t. Every function below that takes a time calls it. False, with a reason
+  // in `control.failure`, if it is undefined.
   bool set_time(double t);
 
   // Start at t from a configuration with phi = w and velocity v' (rho q_dot, also off the manifold).
