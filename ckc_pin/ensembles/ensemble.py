@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import msgspec
 import numpy as np
 
-from ckc_pin.base.interrupt import acknowledge, interrupt_again
+from ckc_pin.base.interrupt import acknowledge, interrupt_again, uninterrupted_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Summary
 from ckc_pin.base.validation import describe_value, require_flag, require_path, require_table, require_type
@@ -307,11 +307,13 @@ def _compute_in_threads(members: Members, task: SweepTask, pending: Iterable[tup
 def _write_chunks(
     store: Store, chunks: Iterator[Chunk], members: Members, advance: Advance | None, finished: int
 ) -> None:
-    for chunk in chunks:
-        store.write(chunk, members.names)
-        finished += len(chunk.status)
-        if advance is not None:
-            advance(finished, store.count)
+    # Zarr writes files in another thread, which would continue after an interrupt while the statuses are counted.
+    with uninterrupted_thread() as pool:
+        for chunk in chunks:
+            pool.submit(store.write, chunk, members.names).result()
+            finished += len(chunk.status)
+            if advance is not None:
+                advance(finished, store.count)
 
 
 def _describe_content(task: SweepTask, members: Members) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import multiprocessing
 import signal
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from zarr.storage import LocalStore
 
 import ckc_pin
 from ckc_pin.base.atomic_files import temporary_folder
@@ -84,6 +86,23 @@ def test_a_store_that_is_interrupted_while_created_is_removed(tmp_path: Path, mo
     with pytest.raises(KeyboardInterrupt):
         run_sweep(load_sweep_task(write_sweep(tmp_path)), out)
     assert not list(out.iterdir())
+
+
+def test_members_are_counted_after_an_interrupted_write_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_value = LocalStore.set
+
+    async def slow_set(store: LocalStore, key: str, *arguments: Any) -> None:
+        if key.startswith("status/c/"):
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            await asyncio.sleep(0.3)
+        await set_value(store, key, *arguments)
+
+    monkeypatch.setattr(LocalStore, "set", slow_set)
+    result = run_sweep(load_sweep_task(write_sweep(tmp_path)), tmp_path / "o", chunk=3)
+    assert result.status == "interrupted"
+    assert result.done == 3 == int((open_results(tmp_path / "o")["status"] == 1).sum())
 
 
 def interrupted_rows(*_: Any) -> tuple[None, str, str]:
