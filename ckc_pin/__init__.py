@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from ckc_pin.analysis.check import Check, check
     from ckc_pin.codegen.symbolic import Symbolic
     from ckc_pin.control.controllers import Controller, SetPoint, Tracking
+    from ckc_pin.control.forces import Force
+    from ckc_pin.control.joint_servo import JointServo
     from ckc_pin.control.sampled import Sampled
     from ckc_pin.dynamics.terms import Terms, terms
     from ckc_pin.ensembles.ensemble import ensemble
@@ -70,8 +72,10 @@ __all__ = [
     "Controller",
     "Event",
     "Floquet",
+    "Force",
     "GainLocus",
     "InputError",
+    "JointServo",
     "LinearModel",
     "Mechanism",
     "MechanismError",
@@ -115,8 +119,10 @@ MODULES = {
     "Controller": "control.controllers",
     "Event": "run.events",
     "Floquet": "sensitivity.floquet",
+    "Force": "control.forces",
     "GainLocus": "linear.locus",
     "InputError": "errors",
+    "JointServo": "control.joint_servo",
     "LinearModel": "linear.linear_model",
     "Mechanism": "mechanism",
     "MechanismError": "errors",

@@ -18,7 +18,7 @@ from ckc_pin.codegen.library import find_compiled_terms
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.spec import SampledSpec
 from ckc_pin.control.workspace import DesiredCheck
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import load
@@ -270,6 +270,8 @@ def _check_stability(
     mechanism, spec = actuation.mechanism, scene.spec
     if start is None:
         return Stability(None, f"a run cannot start: {error_message}")
+    if spec.force:
+        return Stability(None, "the linear model has no forces on links")
     if desired is not None and desired.leaves_at is not None:
         return Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")
     sampled = apply_sampling(scene, controller)
@@ -290,7 +292,7 @@ def _omitted_parts(scene: Scene, actuation: Actuation) -> tuple[str, ...]:
     """Return the parts of a scene that the linear model of its closed loop leaves out."""
     spec, joints = scene.spec.controller, actuation.mechanism.joints
     parts = {
-        "sensor and drive": isinstance(spec, FeedbackSpec) and (spec.sensor or spec.drive) is not None,
+        "sensor and drive": isinstance(spec, SampledSpec) and (spec.sensor or spec.drive) is not None,
         "torque limits": bool(np.isfinite(actuation.limit).any()),
         "stops": bool(joints.stopped.any()),
         "dry friction": bool(joints.friction.any()) and scene.spec.friction_smoothing is None,

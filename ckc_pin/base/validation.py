@@ -96,17 +96,18 @@ def accepts_arguments(function: Callable[..., Any], count: int) -> bool:
     return True
 
 
-def require_controller_signature(function: Callable[..., Any], name: str, where: str) -> None:
-    """Require a function that can be called with (t, terms).
+def require_controller_signature(function: Callable[..., Any], name: str, where: str, count: int = 2) -> None:
+    """Require a function that can be called with (t, terms), or with (t, terms, state) if `count` is 3.
 
     Raises
     ------
     InputError
         It takes other arguments.
     """
-    if not accepts_arguments(function, 2):
+    if not accepts_arguments(function, count):
         parameters = ", ".join(signature(function).parameters)
-        raise InputError(f"{where}: expected a function of (t, terms), got {name}({parameters})")
+        expected = "(t, terms, state)" if count == 3 else "(t, terms)"
+        raise InputError(f"{where}: expected a function of {expected}, got {name}({parameters})")
 
 
 def require_callable(value: Any, where: str, expected: str, count: int = 2) -> None:

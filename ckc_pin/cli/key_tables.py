@@ -34,7 +34,7 @@ def tables(file: str) -> tuple[KeyTable, ...]:
 
 
 def find_tables(name: str) -> list[tuple[str, KeyTable]]:
-    """Return the tables of a name with their files: a file, a table's path or its last part, or a type.
+    """Return the tables of a name with their files: a file, a table's path or else its last part, or a type.
 
     Examples are ``scene``, ``motor``, ``controller.desired``, ``desired``, ``scene.solver`` and ``set_point``. The name
     of a file stands for all its tables.
@@ -47,7 +47,8 @@ def find_tables(name: str) -> list[tuple[str, KeyTable]]:
     if name in FILES:
         return [(name, table) for table in tables(name)]
     named = [(file, table) for file in FILES for table in tables(file)]
-    matches = [(file, table) for file, table in named if name in _names(file, table)]
+    of_path = [(file, table) for file, table in named if name == _names(file, table)[0]]
+    matches = of_path or [(file, table) for file, table in named if name in _names(file, table)]
     if not matches:
         names = list(dict.fromkeys([*FILES, *(_names(file, table)[0] for file, table in named if table.path)]))
         nearest = suggest_name(name, dict.fromkeys(each for file, table in named for each in _names(file, table)))

@@ -7,14 +7,17 @@ from collections.abc import Callable
 from ckc_pin.base.sources import Sources
 from ckc_pin.control.controllers import ControllerModel, RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.desired import read_columns
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.point_path import make_desired
-from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec, gain_matrix
+from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SetPointSpec, TorquesSpec, gain_matrix
 from ckc_pin.dynamics.formulations import CoriolisVelocity
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["make_controller", "read_torques"]
+__all__ = ["SceneController", "make_controller", "read_torques"]
+
+SceneController = SetPoint | Tracking | RecordedTorques | JointServo
 
 END_TOLERANCE = 1e-9  # relative to t_end: torques may end this much earlier
 
@@ -27,7 +30,7 @@ def make_controller(
     sources: Sources,
     start: Kinematics,
     load_model: Callable[[str], Mechanism],
-) -> SetPoint | Tracking | RecordedTorques:
+) -> SceneController:
     """Build and check a controller.
 
     Parameters
@@ -52,6 +55,8 @@ def make_controller(
     """
     if isinstance(spec, TorquesSpec):
         return read_torques(spec, plant, sources, t_end)
+    if isinstance(spec, JointServoSpec):
+        return JointServo(plant, spec.motor, gravity=spec.gravity, sample_time=spec.sample_time)
     names = plant.independent
     model = ControllerModel(load_model(spec.model), plant, convention) if spec.model is not None else None
     if isinstance(spec, SetPointSpec):

@@ -31,6 +31,8 @@ __all__ = [
     "TorqueController",
     "Tracking",
     "as_controller",
+    "has_state",
+    "initial_state",
     "is_torque_controller",
     "require_no_memory",
 ]
@@ -47,6 +49,22 @@ class Controller(Protocol):
 
     def u(self, t: float, terms: Terms) -> Array:
         """Return the force on the independent coordinates at time t (s), shape (d,), N m or N."""
+
+
+class ControllerWithState(Protocol):
+    """A controller with a state of its own, such as the integral of an error, that is integrated with the motion.
+
+    `u` or `tau` take the state as a third argument. A sampled controller's state advances by sample_time * state_dot.
+
+    Attributes
+    ----------
+    initial_state : (k,) array
+    """
+
+    initial_state: Array
+
+    def state_dot(self, t: float, terms: Terms, state: Array) -> Array:
+        """Return the rate of the state at time t (s), shape (k,)."""
 
 
 class TorqueController(Protocol):
@@ -92,7 +110,10 @@ def as_controller(value: Any) -> Controller | TorqueController:
         name = method or getattr(value, "__name__", type(value).__name__)
         if isinstance(function, type):
             raise InputError(f"controller: {name}: expected a function of (t, terms), got {describe_value(function)}")
-        require_controller_signature(function, name, "controller")
+        require_controller_signature(function, name, "controller", count=3 if has_state(value) else 2)
+    if has_state(value):
+        require_controller_signature(value.state_dot, "state_dot", "controller", count=3)
+        initial_state(value)
     if methods:
         _require_lyapunov(getattr(value, "lyapunov", None))
     if type(value) is SetPoint or type(value) is Tracking:  # a subclass may have other attributes
@@ -115,7 +136,11 @@ def require_no_memory(controller: Controller | TorqueController, start: Terms, o
         At t = 0, and at another state later.
     """
     method = "tau" if is_torque_controller(controller) else "u"
-    law: Callable[[float, Terms], Any] = getattr(controller, method)
+    arguments = (initial_state(controller),) if has_state(controller) else ()
+
+    def law(t: float, terms: Terms) -> Any:
+        return getattr(controller, method)(t, terms, *arguments)
+
     try:
         first, _, again = law(start.t, start), law(other.t, other), law(start.t, start)
         differs = not np.array_equal(np.asarray(first, dtype=float), np.asarray(again, dtype=float), equal_nan=True)
@@ -154,6 +179,33 @@ def is_torque_controller(controller: Controller | TorqueController) -> bool:
             "force on the independent coordinates, and tau(t, terms), for the motors' torques"
         )
     return has_tau
+
+
+def has_state(controller: Any) -> bool:
+    """Return whether a controller has a state of its own, whose rate is its method `state_dot`."""
+    return callable(getattr(controller, "state_dot", None))
+
+
+def initial_state(controller: Any) -> Array:
+    """Return the initial state of a controller, shape (k,); empty if it has none.
+
+    Raises
+    ------
+    InputError
+        Its attribute `initial_state` is missing, or not a vector of finite numbers.
+    """
+    if not has_state(controller):
+        return np.zeros(0)
+    try:
+        state = np.array(getattr(controller, "initial_state", None), dtype=float)
+    except (TypeError, ValueError):
+        state = np.full(1, np.nan)
+    if state.ndim != 1 or not np.all(np.isfinite(state)):
+        raise InputError(
+            f"controller: {type(controller).__name__} has state_dot; its attribute initial_state must be a vector of "
+            f"finite numbers, got {describe_value(getattr(controller, 'initial_state', None))}"
+        )
+    return state
 
 
 class ControllerModel:
@@ -342,6 +394,7 @@ class RecordedTorques:
     def __init__(self, times: Array, values: Array, *, interpolates: bool) -> None:
         first = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
         self.times, self.values, self.interpolates = times[first:], values[first:], interpolates
+        self.corners = self.times if interpolates else np.zeros(0)  # where the rate of the torques jumps
 
     def tau(self, t: float, terms: Terms) -> Array:
         """Return the torques at time t (s), shape (motors,)."""

@@ -32,6 +32,7 @@ __all__ = [
     "make_motion",
     "read_columns",
     "read_desired",
+    "read_some_columns",
     "read_table",
 ]
 
@@ -257,6 +258,35 @@ def read_columns(text: str, names: Sequence[str], file: str, min_rows: int, requ
     InputError
         Other columns, too few rows, a value that is not a finite number, times that do not increase or start after 0.
     """
+    lines, header = _read_lines(text, file)
+    columns = ["t", *names]
+    if sorted(header) != sorted(columns):
+        problem = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
+        raise InputError(f"{file}: {problem}; the first line must name the columns {', '.join(columns)}")
+    return _read_rows(lines, header, columns, file, min_rows, requirement)
+
+
+def read_some_columns(
+    text: str, names: Sequence[str], file: str, min_rows: int, requirement: str
+) -> tuple[Array, Array]:
+    """Read `t` and one or more of the named columns, as `read_columns` does. Columns that are not there are zero."""
+    lines, header = _read_lines(text, file)
+    unknown = next((name for name in header if name not in ("t", *names)), None)
+    if unknown is not None or "t" not in header or len(set(header)) < max(2, len(header)):
+        problem = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
+        raise InputError(f"{file}: {problem}; the first line must name t and some of {', '.join(names)}, each once")
+    there = [name for name in names if name in header]
+    t, values = _read_rows(lines, header, ["t", *there], file, min_rows, requirement)
+    table = np.zeros((len(t), len(names)))
+    table[:, [names.index(name) for name in there]] = values
+    return t, table
+
+
+Lines = list[tuple[int, list[str]]]
+
+
+def _read_lines(text: str, file: str) -> tuple[Lines, list[str]]:
+    """Return the lines of a CSV text that are not empty, with their numbers, and the names in the first one."""
     import csv
 
     reader = csv.reader(text.splitlines())  # quoted names may contain commas
@@ -264,11 +294,13 @@ def read_columns(text: str, names: Sequence[str], file: str, min_rows: int, requ
         lines = [(reader.line_num, cells) for cells in reader if cells and (len(cells) > 1 or cells[0].strip())]
     except csv.Error as error:
         raise InputError(f"{file}, line {reader.line_num}: {error}") from None
-    columns = ["t", *names]
-    header = [cell.strip() for cell in lines[0][1]] if lines else []
-    if sorted(header) != sorted(columns):
-        problem = f"its header is {','.join(header)[:80]!r}" if lines else "it is empty"
-        raise InputError(f"{file}: {problem}; the first line must name the columns {', '.join(columns)}")
+    return lines, [cell.strip() for cell in lines[0][1]] if lines else []
+
+
+def _read_rows(
+    lines: Lines, header: list[str], columns: list[str], file: str, min_rows: int, requirement: str
+) -> tuple[Array, Array]:
+    """Return t and the other columns, in the order of `columns`."""
     if len(lines) - 1 < min_rows:
         raise InputError(f"{file}: {len(lines) - 1} rows; {requirement} at least {min_rows}")
     table = np.array([_read_row(cells, len(columns), f"{file}, line {number}") for number, cells in lines[1:]])

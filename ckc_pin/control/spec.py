@@ -20,9 +20,12 @@ __all__ = [
     "DriveSpec",
     "FeedbackSpec",
     "Gain",
+    "JointServoSpec",
     "Limit",
     "MotionSpec",
+    "SampledSpec",
     "SensorSpec",
+    "ServoSpec",
     "SetPointSpec",
     "TableSpec",
     "TorquesSpec",
@@ -125,17 +128,11 @@ class _ControllerSpec(FileStruct, frozen=True, kw_only=True, tag_field="type"):
     torque_limit: Limit | dict[str, Limit] | None = None
 
 
-class _FeedbackSpec(_ControllerSpec, frozen=True, kw_only=True):
-    """Keys of the controllers of eqs. 14 and 16.
+class _SampledSpec(_ControllerSpec, frozen=True, kw_only=True):
+    """Keys of controllers that can be sampled.
 
     Attributes
     ----------
-    allocation
-        Allocation of u among redundant motors.
-        ``allocation = {weights = {left = 2.0}}``
-    model
-        The controller's own model of the plant: a mechanism file.
-        ``model = "lighter.toml"``
     sample_time : s
         Period of a sampled controller, which holds u between samples; default: continuous.
         ``sample_time = 0.002``
@@ -150,12 +147,27 @@ class _FeedbackSpec(_ControllerSpec, frozen=True, kw_only=True):
         ``drive = {torque_resolution = 0.01}``
     """
 
-    allocation: AllocationSpec | None = None
-    model: str | None = None
     sample_time: Limit | None = None
     delay: Size = 0.0
     sensor: SensorSpec | None = None
     drive: DriveSpec | None = None
+
+
+class _FeedbackSpec(_SampledSpec, frozen=True, kw_only=True):
+    """Keys of the controllers of eqs. 14 and 16.
+
+    Attributes
+    ----------
+    allocation
+        Allocation of u among redundant motors.
+        ``allocation = {weights = {left = 2.0}}``
+    model
+        The controller's own model of the plant: a mechanism file.
+        ``model = "lighter.toml"``
+    """
+
+    allocation: AllocationSpec | None = None
+    model: str | None = None
 
 
 class SetPointSpec(_FeedbackSpec, frozen=True, tag="set_point"):
@@ -217,10 +229,6 @@ class TorquesSpec(_ControllerSpec, frozen=True, tag="torques"):
     interpolation: Literal["hold", "linear"] = "hold"
 
 
-FeedbackSpec = SetPointSpec | TrackingSpec
-ControllerSpec = SetPointSpec | TrackingSpec | TorquesSpec
-
-
 class Waypoints(Protocol):
     """The keys of a table that describe a motion through waypoints."""
 
@@ -276,6 +284,67 @@ class MotionSpec(FileStruct, frozen=True, kw_only=True):
     profile: Profile | None = None
     max_rate: Limit | None = None
     max_acceleration: Limit | None = None
+
+
+class ServoSpec(FileStruct, frozen=True, kw_only=True):
+    """Servo of the joint that a motor drives.
+
+    The force on the joint is -K_P e - K_I ∫e dt - K_D ė, where e is the position minus the desired one. In velocity
+    mode e is the rate minus the desired one, and there is no K_D.
+
+    Attributes
+    ----------
+    mode
+        What is controlled.
+        ``mode = "velocity"``
+    K_P : N m/rad or N/m; in velocity mode N m s/rad or N s/m
+        Proportional gain, at the joint.
+        ``K_P = 50.0``
+    K_I : N m/(rad s) or N/(m s); in velocity mode N m/rad or N/m
+        Integral gain. The integral starts at 0.
+        ``K_I = 20.0``
+    K_D : N m s/rad, N s/m
+        Derivative gain, of ``mode = "position"`` only.
+        ``K_D = 2.0``
+    anti_windup : s
+        While the motor is at its torque limit, the integral approaches the value that the limit admits with this time
+        constant; default K_P / K_I, or 1 s without K_P.
+        ``anti_windup = 0.1``
+    desired
+        Motion of the joint, as in ``[controller.desired]``; at rest at 0 if absent.
+        ``desired = {rate = 6.2832}``
+    """
+
+    mode: Literal["position", "velocity"] = "position"
+    K_P: Size = 0.0
+    K_I: Size = 0.0
+    K_D: Size = 0.0
+    anti_windup: Limit | None = None
+    desired: MotionSpec = MotionSpec()
+
+
+class JointServoSpec(_SampledSpec, frozen=True, tag="joint_servo"):
+    """P, PI, PD or PID control of single joints: ``type = "joint_servo"``.
+
+    The motors need not drive independent coordinates, and motors without a servo have no torque.
+
+    Attributes
+    ----------
+    motor
+        A servo for each of some motors, each of which drives one joint.
+        ``motor = {crank = {K_P = 50.0, K_D = 2.0, desired = {offset = 0.3}}}``
+    gravity
+        Add the torques that balance gravity and springs at rest.
+        ``gravity = true``
+    """
+
+    motor: dict[str, ServoSpec]
+    gravity: bool = False
+
+
+FeedbackSpec = SetPointSpec | TrackingSpec
+SampledSpec = FeedbackSpec | JointServoSpec
+ControllerSpec = SampledSpec | TorquesSpec
 
 
 class TableSpec(FileStruct, frozen=True, kw_only=True):

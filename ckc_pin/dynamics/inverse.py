@@ -58,7 +58,9 @@ def loop_wrenches(terms: Terms, multipliers: Array) -> dict[str, Array]:
     return wrenches
 
 
-def joint_wrenches(terms: Terms, acceleration: Array, multipliers: Array) -> dict[str, Array]:
+def joint_wrenches(
+    terms: Terms, acceleration: Array, multipliers: Array, applied: Array | float = 0.0
+) -> dict[str, Array]:
     """Return the wrench that each joint transmits to the body it carries, at the joint's origin, in world axes.
 
     The component along the axis is the sum of motor, joint spring, damper, friction, gear and rotor inertia. The other
@@ -72,6 +74,8 @@ def joint_wrenches(terms: Terms, acceleration: Array, multipliers: Array) -> dic
         Time derivative of v'.
     multipliers : (rows,) array
         Multipliers of eq. 1, N or N m.
+    applied : (joints, 6) array, optional
+        Wrenches of other forces on the bodies, in world axes, about the world's origin.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def joint_wrenches(terms: Terms, acceleration: Array, multipliers: Array) -> dic
     mechanism, pose = terms.mechanism, terms.at.pose
     tree = mechanism.tree
     external = np.einsum("r,rjk->jk", multipliers, mechanism.closure.body_jacobian(pose))
-    external += mechanism.springs.body_wrenches(pose, terms.v_tree)
+    external += mechanism.springs.body_wrenches(pose, terms.v_tree) + applied
     in_joints = _rotate(_shift_reference(external, pose.translation), pose, to_world=False)
 
     def compute_forces(model: Any, data: Any, *state: Array) -> list[Array]:

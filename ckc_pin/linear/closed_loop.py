@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.forces import BodyForce
 from ckc_pin.dynamics.formulations import tree_force
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
@@ -92,7 +94,14 @@ class ClosedLoop:
         self._law = law
         self._native = _core.Feedback(self._table, self._actuation | {"law": law_table(law)})
 
-    def linearize(self, t: float, terms: Terms, u_tree: Array | float = 0.0, locked: IntArray = NONE) -> Feedback:
+    def linearize(
+        self,
+        t: float,
+        terms: Terms,
+        u_tree: Array | float = 0.0,
+        locked: IntArray = NONE,
+        forces: Sequence[BodyForce] = (),
+    ) -> Feedback:
         """Linearize plant and controller about a state.
 
         Parameters
@@ -105,6 +114,8 @@ class ClosedLoop:
             Other forces on the tree that do not depend on the state, such as friction of sliding joints.
         locked : int array, optional
             Coordinates of joints that stick or are at a stop.
+        forces : sequence of BodyForce, optional
+            Constant forces on links.
 
         Raises
         ------
@@ -116,7 +127,7 @@ class ClosedLoop:
             reason = derivatives or NOT_DIFFERENTIABLE
             raise NumericalError(f"{mechanism.name}: the controller cannot be differentiated there: {reason}")
         force, force_by_q, force_by_v = derivatives
-        plant = self._plant.at(terms, force + u_tree, locked)
+        plant = self._plant.at(terms, force + u_tree, locked, forces)
         q = mechanism.partition.q
         other_joints = np.setdiff1d(np.flatnonzero(force_by_q.any(axis=1) | force_by_v.any(axis=1)), q)
         driven = np.concatenate([q, other_joints])

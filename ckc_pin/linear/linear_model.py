@@ -17,6 +17,7 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
+from ckc_pin.control.forces import COMPONENTS, BodyForce, force_values, generalized_force, unit_forces
 from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -50,7 +51,8 @@ class LinearModel(HasSummary):
     t : float or None
         Time of a state of a run, s.
     states, inputs, outputs : tuple of str
-        The states are d coordinates and then their rates, ``NAME_dot``. The inputs are the motors. The outputs are the
+        The states are d coordinates and then their rates, ``NAME_dot``. The inputs are the motors, and the components
+        of the scene's forces on links, ``force.NAME.fx``. The outputs are the
         coordinates of the tree, ``point:NAME.x`` and ``loop:LOOP.ROW``, the multipliers of eq. 1. A free root has
         tangent coordinates in its own axes.
     A, B, C, D : arrays
@@ -249,6 +251,7 @@ def linear_model(
     locked: IntArray = NONE,
     smoothing: float | None = None,
     library: Library | None = None,
+    forces: Sequence[BodyForce] = (),
     notes: tuple[str, ...] = (),
 ) -> LinearModel:
     """Linearize eq. 1 about a state.
@@ -271,6 +274,8 @@ def linear_model(
         Rate over which dry friction grows, as a scene's friction_smoothing.
     library : Library, optional
         Compiled terms of the mechanism.
+    forces : sequence of BodyForce, optional
+        Constant forces on links, whose components become inputs.
     notes : tuple of str, optional
         Notes about the state, which come before those about the model.
 
@@ -290,7 +295,9 @@ def linear_model(
         )
     _require_mass(terms, locked)
     u_tree = mechanism.motors.force(tau) + u_tree
-    plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked)
+    plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked, forces)
+    push = unit_forces(forces, terms)
+    u_tree = u_tree + generalized_force(forces, force_values(forces, 0.0, terms), terms)
     if not len(plant.at):
         raise InputError(f"{mechanism.name}: no freedom remains to linearize: {_explain_locked(mechanism, locked)}")
     if not np.all(np.isfinite(plant.A)):
@@ -306,16 +313,21 @@ def linear_model(
         at=at,
         t=t,
         states=(*chart, *(f"{name}_dot" for name in chart)),
-        inputs=mechanism.actuated,
+        inputs=(
+            *mechanism.actuated,
+            *(f"force.{force.name}.{component}" for force in forces for component in COMPONENTS),
+        ),
         outputs=(
             *mechanism.coordinates,
             *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
             *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
         ),
         A=plant.A,
-        B=plant.B,
+        B=np.hstack([plant.B, np.vstack([np.zeros((len(chart), push.shape[1])), plant.a_u[plant.at] @ push])]),
         C=np.block([[positions, zero], [multipliers_by_q, plant.multipliers_v @ plant.T]]),
-        D=np.vstack([np.zeros((len(zero), len(mechanism.actuated))), plant.multipliers_u @ turns]),
+        D=np.vstack(
+            [np.zeros((len(zero), turns.shape[1] + push.shape[1])), plant.multipliers_u @ np.hstack([turns, push])]
+        ),
         q_tree=mechanism.tree.to_coordinates(terms.q_tree),
         v_tree=terms.v_tree,
         tau=tau,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,10 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
+from ckc_pin.control.build import SceneController
+from ckc_pin.control.controllers import RecordedTorques, SetPoint
+from ckc_pin.control.forces import BodyForce
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
@@ -35,7 +38,12 @@ from ckc_pin.run.inverse import RecordedJoints
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.parts import (
+    build_scene_actuation,
+    build_scene_controller,
+    build_scene_forces,
+    load_scene_mechanism,
+)
 from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, is_scene_name, load_scene, make_scene
 
 __all__ = ["At", "linearize"]
@@ -63,6 +71,12 @@ class _Subject:
     @property
     def actuation(self) -> Actuation:
         return Actuation(self.mechanism) if self.scene is None else build_scene_actuation(self.scene, self.mechanism)
+
+    @property
+    def forces_at_rest(self) -> list[BodyForce]:
+        """The scene's forces on links, with value zero."""
+        forces = [] if self.scene is None else build_scene_forces(self.scene, self.mechanism)
+        return [force.fixed(np.zeros(6)) for force in forces]
 
     @property
     def smoothing(self) -> float | None:
@@ -244,9 +258,13 @@ def _linearize_at_rest(
 ) -> LinearModel:
     sticking = np.flatnonzero(subject.mechanism.joints.friction) if subject.smoothing is None else NONE
     locked = np.union1d(sticking, loaded_stops)
+    forces = subject.forces_at_rest
+    if forces:
+        notes = (*notes, "forces on links are inputs, zero at the state")
     return linear_model(
-        state, tau, at=at, locked=locked, smoothing=subject.smoothing, library=subject.library, notes=notes
-    )
+        state, tau, at=at, locked=locked, smoothing=subject.smoothing, library=subject.library, forces=forces,
+        notes=notes,
+    )  # fmt: skip
 
 
 # --- along a run ---------------------------------------------------------------------------------
@@ -269,6 +287,8 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
     joints = RecordedJoints(run)
     locked, smoothing = joints.locked[k], subject.smoothing
     friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sliding_signs[k]
+    values = np.zeros((0, 6)) if run.force_values is None else run.force_values[k].reshape(-1, 6)
+    forces = [force.fixed(value) for force, value in zip(run.placed_forces, values, strict=True)]
     model = linear_model(
         state,
         run.tau[k],
@@ -278,27 +298,29 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
         locked=locked,
         smoothing=smoothing,
         library=subject.library,
+        forces=forces,
         notes=_describe_instant(scene, run, k),
     )
     law = build_scene_controller(scene, mechanism)
-    return model if law is None else _add_closed_loop(subject, model, law, t, state, friction)
+    return model if law is None else _add_closed_loop(subject, model, law, t, state, friction, forces)
 
 
 def _add_closed_loop(
     subject: _Subject,
     model: LinearModel,
-    law: SetPoint | Tracking | RecordedTorques,
+    law: SceneController,
     t: float,
     state: Terms,
     friction: Array | float,
+    forces: Sequence[BodyForce] = (),
 ) -> LinearModel:
     """Add the closed loop to a model, or a note why it has none."""
-    if isinstance(law, RecordedTorques):
+    if isinstance(law, RecordedTorques | JointServo):
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
     locked = np.array([model.coordinates.index(name) for name in model.locked], np.intp)
     try:
         loop = ClosedLoop(subject.mechanism, law, subject.smoothing, subject.library, subject.actuation)
-        A_closed = loop.linearize(t, state, friction, locked).A_closed
+        A_closed = loop.linearize(t, state, friction, locked, forces).A_closed
     except NumericalError as error:
         note = f"A and B are the plant's, without the scene's controller, because {error}"
         return replace(model, notes=(*model.notes, note))

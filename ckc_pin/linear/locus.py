@@ -113,6 +113,7 @@ def gain_locus(
         what = load_scene(what, overrides)
     elif overrides:
         raise InputError("gain_locus: overrides are accepted only with the name or path of a scene, not with a Scene")
+    what.refuse_forces("gain_locus")
     mechanism = load_scene_mechanism(what)
     law = build_scene_controller(what, mechanism)
     if not isinstance(law, SetPoint | Tracking):

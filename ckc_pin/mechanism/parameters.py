@@ -54,8 +54,8 @@ OF_ENTRY = {
 
 
 def is_parameter(key: str) -> bool:
-    """Whether a dotted key names a number of the mechanism, not one of the scene."""
-    return key.partition(".")[0] in ROOTS
+    """Whether a dotted key names a number of the mechanism, not one of the scene, whose key ``force`` has no dot."""
+    return key.partition(".")[0] in ROOTS and key != "force"
 
 
 def plain_values(values: Mapping[str, Any]) -> dict[str, Value]:

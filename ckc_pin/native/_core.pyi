@@ -54,6 +54,10 @@ class Core:
 class View:
     """The state of the loop during a callback."""
 
+    @property
+    def law_state(self) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]:
+        """State of the control law."""
+
     def term(self, stamp: int, name: str) -> Any: ...
 
 class StopReason(enum.Enum):
@@ -741,10 +745,11 @@ class Linearization:
     ) -> None: ...
     def at(
         self,
-        q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
-        v_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
-        u_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
-        locked: Sequence[int],
+        q_tree: numpy.typing.NDArray[numpy.float64],
+        v_tree: numpy.typing.NDArray[numpy.float64],
+        u_tree: numpy.typing.NDArray[numpy.float64],
+        locked: list[int],
+        forces: list[dict[str, Any]],
     ) -> dict[str, Any] | None:
         """Return the linearization at one state; None if J has lost rank."""
 

@@ -7,7 +7,7 @@ to the motors can also be computed alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,13 @@ from ckc_pin.control.controllers import (
     SetPoint,
     TorqueController,
     Tracking,
+    has_state,
+    initial_state,
     is_torque_controller,
 )
 from ckc_pin.control.desired import Desired, Harmonics, Sum
+from ckc_pin.control.forces import BodyForce
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.control.point_path import Circle, Line, PointPath, PointTrajectory
 from ckc_pin.control.sampled import Sampled
@@ -33,16 +37,26 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.tables import closure_table, core_table, packed
 
-__all__ = ["actuation_table", "allocate", "apply_u", "control_table", "law_table", "prescribed_table"]
+__all__ = [
+    "actuation_table",
+    "allocate",
+    "apply_u",
+    "breakpoints_table",
+    "control_table",
+    "force_tables",
+    "law_table",
+    "prescribed_table",
+]
 
 QUARTER = math.pi / 2
+RELATIVE_TOLERANCE = 1e-9  # of the shortest time between breakpoints: instants closer than this are one
 TIME_TOLERANCE = 1e-9  # s, and relative to the time: breaks of a desired motion closer than this are one
 
 
 def control_table(
     controller: Controller | TorqueController | Sampled | None,
     actuation: Actuation,
-    call: Callable[[Controller | TorqueController], Callable[..., Any]],
+    call: Callable[[Any, str], Callable[..., Any]],
     *,
     differentiates: bool = False,
 ) -> dict[str, Any]:
@@ -53,8 +67,8 @@ def control_table(
     controller : Controller, TorqueController, Sampled or None
     actuation : Actuation
     call : callable
-        Wraps a controller that the core does not implement as a function of the core's view of the state, which
-        returns u or tau.
+        Wraps a method of a controller that the core does not implement, "u", "tau" or "state_dot", as a function of
+        the core's view of the state.
     differentiates : bool
         The core differentiates such a controller with respect to the state by finite differences.
 
@@ -77,19 +91,45 @@ def control_table(
     torques = is_torque_controller(controller)
     if type(controller) is RecordedTorques:
         spacing = float(np.diff(controller.times).min(initial=np.inf))
-        table["clock"] = _clock(min(spacing, 1.0), times=controller.times, holds_output=not controller.interpolates)
-    if type(controller) is Tracking and "clock" not in table:
-        corners = _distinct(getattr(controller.desired, "corners", ()))
-        if len(corners):
-            spacing = float(np.diff(corners, prepend=0.0).min())
-            table["clock"] = _clock(min(spacing, 1.0), times=corners, holds_output=False)
+        if not controller.interpolates:
+            table["clock"] = _clock(min(spacing, 1.0), times=controller.times)
     callback = {
         "kind": "call",
-        "function": call(controller),
+        "function": call(controller, "tau" if torques else "u"),
+        "state_rate": call(controller, "state_dot") if has_state(controller) else None,
+        "initial_state": initial_state(controller),
         "outputs_torques": torques,
         "differentiates": differentiates,
     }
     return table | {"law": law_table(controller) or callback}
+
+
+def breakpoints_table(functions: Iterable[Any]) -> dict[str, Any] | None:
+    """Return the table of the instants at which functions of time, or low derivatives, jump; None if there are none.
+
+    Parameters
+    ----------
+    functions : iterable of callables
+        Their attribute `corners`, if they have one, lists these times, s.
+    """
+    times = np.unique(np.concatenate([np.zeros(0), *(getattr(f, "corners", np.zeros(0)) for f in functions)]))
+    times = _distinct(times)
+    if not len(times):
+        return None
+    spacing = float(np.diff(times, prepend=0.0).min())
+    return {"times": times, "tolerance": RELATIVE_TOLERANCE * min(spacing, 1.0)}
+
+
+def force_tables(
+    forces: Sequence[BodyForce], call: Callable[[BodyForce], Callable[..., Any]] | None = None
+) -> list[dict[str, Any]]:
+    """Return the tables of forces on links. `call` wraps those that are functions of the state."""
+    return [
+        {"joint": force.frame.joint, "origin": force.frame.translation, "in_world": force.in_world,
+         "axes": np.asfortranarray(force.frame.rotation),
+         **({"function": call(force)} if force.over_time is None and call else {"values": _spline(force.over_time)})}
+        for force in forces
+    ]  # fmt: skip
 
 
 def actuation_table(actuation: Actuation) -> dict[str, Any]:
@@ -158,15 +198,8 @@ def prescribed_table(mechanism: Mechanism, motion: Desired, *, smooth_friction: 
     }
 
 
-def _clock(
-    period: float, delay: float = 0.0, times: Array | None = None, *, holds_output: bool = True
-) -> dict[str, Any]:
-    return {
-        "period": period,
-        "delay": delay,
-        "times": np.zeros(0) if times is None else times,
-        "holds_output": holds_output,
-    }
+def _clock(period: float, delay: float = 0.0, times: Array | None = None) -> dict[str, Any]:
+    return {"period": period, "delay": delay, "times": np.zeros(0) if times is None else times}
 
 
 def _distinct(times: Sequence[float] | Array) -> Array:
@@ -210,6 +243,13 @@ def law_table(controller: Controller | TorqueController) -> dict[str, Any] | Non
         gains = {"K_P": controller.K_P, "K_V": controller.K_V}
         return {"kind": "set_point", **gains, "q_d": controller.q_d, "h_d": target.h,
                 "potential": target.potential_energy}  # fmt: skip
+    if type(controller) is JointServo:
+        servos: dict[str, Any] = {
+            "kind": "joint_servo",
+            "servos": controller.servo_tables(),
+            "desired": _desired(controller.desired),
+        }
+        return {**servos, "gravity": actuation_table(controller.balance)} if controller.gravity else servos
     desired = _desired(controller.desired) if type(controller) is Tracking else None
     if type(controller) is not Tracking or desired is None:
         return None
@@ -248,7 +288,8 @@ def _harmonics(offset: Array, amplitude: Array, frequency: Array, phase: Array) 
     return {"kind": "harmonics", "offset": offset, "amplitude": amplitude, "frequency": frequency, "phase": phase}
 
 
-def _spline(motion: PiecewisePolynomial) -> dict[str, Any]:
+def _spline(motion: PiecewisePolynomial | None) -> dict[str, Any]:
+    assert motion is not None
     coefficients = [np.asfortranarray(c) for c in motion.coefficients]
     return {"kind": "spline", "breaks": motion.breaks, "coefficients": coefficients}
 

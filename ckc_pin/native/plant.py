@@ -13,16 +13,19 @@ constant coordinates of v', a and u'.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.codegen.library import Library
+from ckc_pin.control.forces import BodyForce
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
+from ckc_pin.native.control import force_tables
 from ckc_pin.native.tables import core_table
 
 __all__ = ["LOST_RANK", "NONE", "AccelerationDerivatives", "Plant"]
@@ -90,7 +93,9 @@ class Plant:
         self.mechanism = mechanism
         self._native = _core.Linearization(core_table(mechanism, library, smoothing), mechanism.motors.transmission)
 
-    def at(self, terms: Terms, u_tree: Array, locked: IntArray = NONE) -> AccelerationDerivatives:
+    def at(
+        self, terms: Terms, u_tree: Array, locked: IntArray = NONE, forces: Sequence[BodyForce] = ()
+    ) -> AccelerationDerivatives:
         """Solve eq. 1 at a state and differentiate the solution.
 
         Parameters
@@ -101,13 +106,16 @@ class Plant:
             Forces on the tree that do not depend on the state: of actuators and of sliding joints.
         locked : int array, optional
             Coordinates that do not move, as of sticking joints.
+        forces : sequence of BodyForce, optional
+            Constant forces on links.
 
         Raises
         ------
         NumericalError
             J is rank deficient.
         """
-        solution = self._native.at(terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist())
+        tables = force_tables(forces)
+        solution = self._native.at(terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist(), tables)
         if solution is None:
             tree = self.mechanism.tree
             raise NumericalError(

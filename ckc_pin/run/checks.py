@@ -6,9 +6,9 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
+from ckc_pin.control.build import SceneController
 from ckc_pin.control.controllers import (
     Controller,
-    RecordedTorques,
     SetPoint,
     TorqueController,
     Tracking,
@@ -151,7 +151,7 @@ def start_warnings(scene: Scene, mechanism: Mechanism, start: Start) -> list[str
 
 
 def check_desired(
-    controller: SetPoint | Tracking | RecordedTorques | None, mechanism: Mechanism, t_end: float, start: Start | None
+    controller: SceneController | None, mechanism: Mechanism, t_end: float, start: Start | None
 ) -> DesiredCheck | None:
     """Follow a controller's desired motion from the start: can the mechanism do it, and how close to singular is it.
 

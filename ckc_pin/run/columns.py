@@ -14,7 +14,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
 from ckc_pin.mechanism.units import STIFF, VISCOUS, effort, joined, motor_units, parameter_unit, row_units
-from ckc_pin.run.run_file import ARRAYS
+from ckc_pin.run.run_file import ARRAYS, OPTIONAL, WORKS
 
 if TYPE_CHECKING:
     from ckc_pin.run.run import Run
@@ -40,7 +40,19 @@ WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 WRENCH_UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SCALARS = ("energy", "lyapunov", "dissipated")  # recorded quantities of a run with one value per instant, J
 DESIRED = ("desired", "desired_dot", "error")  # arrays that only runs with a desired motion have
-TABLE_ARRAYS = ("q_tree", "v_tree", "u", "tau", *DESIRED, "point_positions", "point_velocities", "phi", "w", "energy")
+TABLE_ARRAYS = (
+    "q_tree",
+    "v_tree",
+    "u",
+    "tau",
+    *DESIRED,
+    "point_positions",
+    "point_velocities",
+    "phi",
+    "w",
+    "energy",
+    "works",
+)
 NEAR_NAMES = 4  # that a message about an unknown name lists
 KEYS_IN_SECONDS = ("t_end", "epsilon", "max_step", "min_step", "max_wall_s", "output_dt", "sample_time", "delay",
                    "filter")  # fmt: skip
@@ -94,6 +106,7 @@ def iterate_quantities(mechanism: Mechanism) -> Iterator[tuple[str, Quantity]]:
     yield "energy.kinetic", Quantity("kinetic_energy", None, "J")
     yield "energy.potential", Quantity("potential_energy", None, "J")
     yield "energy.total", Quantity("energy", None, "J")
+    yield from _name_columns("work.", WORKS, "works", ["J"] * len(WORKS))
     yield from _name_columns("phi.", row_names, "phi", by_quantity["phi"])
     yield from _name_columns("w.", row_names, "w", by_quantity["w"])
     yield "phi.max", Quantity("phi_max", None, joined(by_quantity["phi"]))
@@ -133,10 +146,11 @@ def evaluate_quantity(run: Run, name: str, quantity: Quantity) -> Array:
     InputError
         The run does not determine it.
     """
-    recorded = quantity.array in (*ARRAYS, "desired", "error")
+    recorded = quantity.array in (*ARRAYS, *OPTIONAL, "desired", "error")
     values = getattr(run if recorded else run.derived, quantity.array)
     if values is None:
-        raise InputError(f"run[{name!r}]: the run has no desired motion")
+        reason = "has no works; set work = true" if quantity.array == "works" else "has no desired motion"
+        raise InputError(f"run[{name!r}]: the run {reason}")
     return quantity.select(values)
 
 
@@ -161,8 +175,8 @@ def list_columns(run: Run, names: Sequence[str] | None = None, where: str = "Run
     """
     if names is not None:
         return {name: _select_named(run, name, f"{where}: columns") for name in require_names(names, where)}
-    has_desired = run.desired is not None
-    arrays = [name for name in TABLE_ARRAYS if has_desired or name not in DESIRED]
+    absent = {*(() if run.desired is not None else DESIRED), *(() if run.works is not None else ("works",))}
+    arrays = [name for name in TABLE_ARRAYS if name not in absent]
     columns = [
         (name, evaluate_quantity(run, name, quantity))
         for array in arrays
@@ -246,6 +260,8 @@ def to_dataset(run: Run) -> Any:
         for name, (dimension, values) in vectors.items()
     }
     data |= {name: ("t", getattr(run, name), {"units": "J"}) for name in SCALARS if getattr(run, name) is not None}
+    if run.works is not None:
+        data |= {f"work.{name}": ("t", run.works[:, k], {"units": "J"}) for k, name in enumerate(WORKS)}
     if run.desired_path is not None:
         q_unit, rate_unit = joined(units["error"]), joined(f"{unit}/s" for unit in units["error"])
         data["desired"] = (("t", "independent"), run.desired, {"units": q_unit})

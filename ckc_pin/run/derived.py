@@ -101,7 +101,7 @@ class RunQuantities(DerivedQuantities):
         Raises
         ------
         InputError
-            The run starts off its constraint manifold, or joints are prescribed.
+            The run starts off its constraint manifold.
         """
         if np.any(self._run.w[:1]):
             raise InputError(
@@ -118,7 +118,7 @@ class RunQuantities(DerivedQuantities):
     def _dynamics(self) -> tuple[Array, Array]:
         from ckc_pin.run.inverse import compute_recorded_dynamics  # which uses runs
 
-        return compute_recorded_dynamics(self._run, "accelerations and loop forces of a run")
+        return compute_recorded_dynamics(self._run)
 
     @cached_property
     def joint_wrenches(self) -> Array:

@@ -15,7 +15,7 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.sampled import unwrap_sampled
-from ckc_pin.control.spec import ControllerSpec, SetPointSpec, TorquesSpec
+from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SetPointSpec, TorquesSpec
 from ckc_pin.errors import NumericalError
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def compute_desired_path(run: Run) -> DesiredPath | None:
     if "controller" not in run.scene:
         return None
     spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
-    if isinstance(spec, TorquesSpec):
+    if isinstance(spec, TorquesSpec | JointServoSpec):
         return None
     target: Desired | Array
     if isinstance(spec, SetPointSpec):

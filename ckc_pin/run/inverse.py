@@ -7,7 +7,7 @@ joints slid, stuck and touched stops.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from os.path import isfile
@@ -24,6 +24,8 @@ from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import RecordedTorques, Tracking
 from ckc_pin.control.desired import Desired, find_rate_jump
+from ckc_pin.control.forces import BodyForce, body_wrenches, force_values, generalized_force
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.workspace import find_workspace_exit
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
@@ -34,7 +36,13 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.motion_forces import MotionForces, collect_forces
 from ckc_pin.run.run import Run, Status
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.parts import (
+    build_scene_actuation,
+    build_scene_controller,
+    build_scene_forces,
+    load_scene_mechanism,
+    prescribed_motion,
+)
 from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, as_scene, make_scene
 
 __all__ = ["RecordedJoints", "compute_loop_forces", "compute_recorded_dynamics", "inverse_dynamics"]
@@ -64,6 +72,10 @@ class _Instant:
         Recorded torques or preload; inverse dynamics adds the minimum-norm torques that are missing.
     joint_force : (n,) array
         Generalized force of friction and stops.
+    forces : sequence of BodyForce
+        Forces on links.
+    force_values : (k, 6) array
+        Force and moment of each in its axes.
     """
 
     t: float
@@ -71,6 +83,13 @@ class _Instant:
     acceleration: Array
     tau: Array
     joint_force: Array
+    forces: Sequence[BodyForce]
+    force_values: Array
+
+    @property
+    def other_force(self) -> Array:
+        """Generalized force of everything but the motors, (n,), N m or N."""
+        return self.joint_force + generalized_force(self.forces, self.force_values, self.terms)
 
 
 def inverse_dynamics(
@@ -123,13 +142,16 @@ def inverse_dynamics(
     with one_blas_thread():
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
-            mechanism.refuse_prescribed_joints("inverse_dynamics")
             actuation = build_scene_actuation(scene, mechanism)
             motion, t_end = _recorded_motion(what, mechanism), float(what.t[-1])
         else:
             scene = what
             mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end
-            mechanism.refuse_prescribed_joints("inverse_dynamics")
+            if mechanism.prescribed:
+                raise InputError(
+                    f"inverse_dynamics: the motion of {', '.join(mechanism.prescribed)} is prescribed, so a run "
+                    "computes its torque; give a run of the scene instead of the scene"
+                )
             actuation = build_scene_actuation(scene, mechanism)
             motion = _desired_motion(scene, mechanism, actuation)
         return _collect_motion(motion, mechanism, actuation, scene.name, t_end, progress)
@@ -179,7 +201,8 @@ def _collect_motion(
 def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
     """Solve eq. 1 at one instant for tau and the multipliers, and compute the joint wrenches that follow."""
     terms, acceleration, t = instant.terms, instant.acceleration, instant.t
-    required = tree_force(terms, acceleration) - instant.joint_force
+    other_force = instant.other_force
+    required = tree_force(terms, acceleration) - other_force
     if not np.all(np.isfinite(required)):
         raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
@@ -189,7 +212,8 @@ def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuatio
     if np.any(np.abs(missing) > tolerance + CROSS_TOLERANCE * tolerance.max(initial=0.0)):
         _require_actuated(mechanism, tangent, t)
     tau = instant.tau + actuation.minimum_norm_torques(tangent, missing)
-    forces = multipliers(terms, mechanism.motors.force(tau) + instant.joint_force, acceleration)
+    forces = multipliers(terms, mechanism.motors.force(tau) + other_force, acceleration)
+    applied = body_wrenches(instant.forces, instant.force_values, terms)
     return {
         "t": t,
         "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
@@ -198,7 +222,7 @@ def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuatio
         "tau": tau,
         "multipliers": forces,
         "loop_wrenches": loop_wrenches(terms, forces),
-        "joint_forces": joint_wrenches(terms, acceleration, forces),
+        "joint_forces": joint_wrenches(terms, acceleration, forces, applied),
     }
 
 
@@ -219,8 +243,9 @@ def _require_actuated(mechanism: Mechanism, tangent: Array, t: float) -> None:
 def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
     """Yield the desired motion of a scene's controller, with v' = rho q_dot and its rate rho q_ddot + rho_dot q_dot."""
     controller = build_scene_controller(scene, mechanism)
-    if controller is None or isinstance(controller, RecordedTorques):
-        reason = "no [controller]" if controller is None else 'the controller\'s type is "torques"'
+    if controller is None or isinstance(controller, RecordedTorques | JointServo):
+        name = "torques" if isinstance(controller, RecordedTorques) else "joint_servo"
+        reason = "no [controller]" if controller is None else f'the controller\'s type is "{name}"'
         raise InputError(
             f"{scene.name}: {reason}, so no motion is prescribed; give controller.desired, or a run of the scene"
         )
@@ -232,6 +257,7 @@ def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) ->
             f"{scene.name}: controller.desired: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
             'take another profile, or interpolation, than "linear"'
         )
+    forces = build_scene_forces(scene, mechanism)
     previous_t: float | None = None
     for t in scene.output_instants().tolist():
         q_d, q_d_dot, q_d_ddot = desired(t)
@@ -247,7 +273,9 @@ def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) ->
         at, previous_t = solution.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
         friction = friction_force(mechanism, terms.v_tree)
-        yield _Instant(t, terms, at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot), actuation.preload, friction)
+        acceleration = at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot)
+        values = force_values(forces, t, terms)
+        yield _Instant(t, terms, acceleration, actuation.preload, friction, forces, values)
 
 
 def _rest_at(q_d: Array) -> Desired:
@@ -263,12 +291,36 @@ def _recorded_motion(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
             f"{run.scene_name}: the run starts off phi = 0, with open loops; no forces in a closed mechanism produce "
             "its motion"
         )
-    recorded_joints = RecordedJoints(run)
-    for k, (t, numbers) in enumerate(zip(run.t.tolist(), run.q_tree, strict=True)):
-        terms = Terms(mechanism, mechanism.kinematics(mechanism.tree.from_coordinates(numbers)), run.v_tree[k])
-        u_tree = mechanism.motors.force(run.tau[k])
-        force = recorded_joints.force(k, terms, u_tree)
-        yield _Instant(t, terms, dae_acceleration(terms, u_tree + force), run.tau[k], force)
+    record = _Record(run, mechanism)
+    for k in range(len(run.t)):
+        yield record.instant(k)
+
+
+class _Record:
+    """The instants of a run, with its accelerations by eq. 1."""
+
+    def __init__(self, run: Run, mechanism: Mechanism) -> None:
+        self.run, self.mechanism = run, mechanism
+        self.joints, self.forces = RecordedJoints(run), run.placed_forces
+        self.prescribed = prescribed_motion(run.prescribed) if mechanism.prescribed else None
+
+    def instant(self, k: int) -> _Instant:
+        """Return the instant of a row (NumericalError if J has lost rank there)."""
+        run, mechanism = self.run, self.mechanism
+        at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
+        terms = Terms(mechanism, at, run.v_tree[k])
+        values = np.zeros((0, 6)) if run.force_values is None else run.force_values[k].reshape(-1, 6)
+        u_tree = mechanism.motors.force(run.tau[k]) + generalized_force(self.forces, values, terms)
+        correction = np.zeros(mechanism.closure.rows)
+        friction = np.zeros(mechanism.n)
+        if self.prescribed is not None:  # their motors overcome their friction
+            _, rates, accelerations = self.prescribed(float(run.t[k]))
+            correction[mechanism.prescribed_rows] = -accelerations
+            if self.joints.smoothing is None:
+                friction[mechanism.prescribed_at] = -mechanism.joints.friction[mechanism.prescribed_at] * np.sign(rates)
+        friction += self.joints.force(k, terms, u_tree + friction, correction)
+        acceleration = dae_acceleration(terms, u_tree + friction, correction)
+        return _Instant(float(run.t[k]), terms, acceleration, run.tau[k], friction, self.forces, values)
 
 
 # --- joints of recorded runs ---------------------------------------------------------------------
@@ -298,7 +350,7 @@ class RecordedJoints:
             self.sliding_signs.append(sign.copy())
             self.locked.append(np.flatnonzero(locked))
 
-    def force(self, k: int, terms: Terms, u_tree: Array) -> Array:
+    def force(self, k: int, terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
         """Return the force of friction and stops on the tree at output instant k, shape (n,), N or N m.
 
         Joints that stick or touch a stop have the minimum-norm forces that keep them at rest.
@@ -310,6 +362,8 @@ class RecordedJoints:
             At the instant.
         u_tree : (n,) array
             All other applied forces u'.
+        correction : (rows,) array, optional
+            Minus the acceleration of the constraint rows.
         """
         joints = self.mechanism.joints
         if self.smoothing is not None:
@@ -322,19 +376,19 @@ class RecordedJoints:
         inertia = Factorization(tangent.T @ terms.D_tree @ tangent)
         locked_tangent = tangent[locked]
         responses = locked_tangent @ np.column_stack([inertia.solve(row) for row in locked_tangent])
-        acceleration = dae_acceleration(terms, u_tree + force)[locked]
+        acceleration = dae_acceleration(terms, u_tree + force, correction)[locked]
         force[locked] -= np.linalg.lstsq(responses, acceleration, rcond=HOLDING_RANK_TOLERANCE)[0]
         return force
 
 
 def compute_loop_forces(run: Run) -> dict[str, Array]:
     """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
-    _, forces = compute_recorded_dynamics(run, "loop_forces")
+    _, forces = compute_recorded_dynamics(run)
     loops = [loop for loop, _ in run.mechanism.closure.names]
     return {loop: forces[:, [name == loop for name in loops]] for loop in dict.fromkeys(loops)}
 
 
-def compute_recorded_dynamics(run: Run, function: str) -> tuple[Array, Array]:
+def compute_recorded_dynamics(run: Run) -> tuple[Array, Array]:
     """Return the accelerations of the tree and the multipliers of eq. 1 at a run's output instants.
 
     They follow from the recorded state and motor torques, and from the friction and stops of the run's events.
@@ -342,8 +396,6 @@ def compute_recorded_dynamics(run: Run, function: str) -> tuple[Array, Array]:
     Parameters
     ----------
     run : Run
-    function : str
-        Named in the error.
 
     Returns
     -------
@@ -351,22 +403,13 @@ def compute_recorded_dynamics(run: Run, function: str) -> tuple[Array, Array]:
         Time derivative of v'.
     multipliers : (m, rows) array
         Both are NaN where J has lost rank.
-
-    Raises
-    ------
-    InputError
-        The mechanism has prescribed joints.
     """
-    mechanism, recorded_joints = run.mechanism, RecordedJoints(run)
-    mechanism.refuse_prescribed_joints(function)
+    record = _Record(run, run.mechanism)
     accelerations, forces = np.full_like(run.v_tree, np.nan), np.full_like(run.phi, np.nan)
-    for k, numbers in enumerate(run.q_tree):
-        at = mechanism.kinematics(mechanism.tree.from_coordinates(numbers))
-        terms = Terms(mechanism, at, run.v_tree[k])
-        u_tree = mechanism.motors.force(run.tau[k])
+    for k in range(len(run.t)):
         with suppress(NumericalError):
-            u_tree += recorded_joints.force(k, terms, u_tree)
-            acceleration = dae_acceleration(terms, u_tree)
-            forces[k] = multipliers(terms, u_tree, acceleration)
-            accelerations[k] = acceleration
+            instant = record.instant(k)
+            u_tree = run.mechanism.motors.force(instant.tau) + instant.other_force
+            forces[k] = multipliers(instant.terms, u_tree, instant.acceleration)
+            accelerations[k] = instant.acceleration
     return accelerations, forces

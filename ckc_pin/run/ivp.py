@@ -16,7 +16,7 @@ This is the readable reference. Runs do not use it: the native loop has its own 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -28,7 +28,9 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.forces import BodyForce, force_values, generalized_force
+from ckc_pin.control.joint_servo import JointServo
+from ckc_pin.control.spec import SampledSpec
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
     dae_acceleration,
@@ -44,7 +46,12 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.control import apply_u
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.parts import (
+    build_scene_actuation,
+    build_scene_controller,
+    build_scene_forces,
+    load_scene_mechanism,
+)
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "make_force"]
@@ -107,7 +114,7 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
     """
     scene = as_scene(scene, overrides, "as_ivp")
     spec, mechanism = scene.spec, load_scene_mechanism(scene)
-    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
+    if isinstance(spec.controller, SampledSpec) and spec.controller.sample_time is not None:
         raise InputError("as_ivp: controller.sample_time: a sampled u is not a function of t and y; remove sample_time")
     smoothing = spec.friction_smoothing
     if mechanism.joints.has_events(smoothing):
@@ -116,9 +123,14 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
             "without stops set friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    force = make_force(build_scene_controller(scene, mechanism), build_scene_actuation(scene, mechanism))
+    controller = build_scene_controller(scene, mechanism)
+    if isinstance(controller, JointServo) and len(controller.initial_state):
+        raise InputError("as_ivp: a controller with an integral has a state beside y; set K_I = 0")
+    force = make_force(controller, build_scene_actuation(scene, mechanism))
     if smoothing is not None:
         force = _with_friction(force, mechanism, smoothing)
+    if body_forces := build_scene_forces(scene, mechanism):
+        force = _with_body_forces(force, body_forces)
     span = (0.0, spec.t_end)
     if spec.formulation == "dae":
         return Dae(mechanism, start.at, start.at.rho @ start.q_dot, force, span)
@@ -136,9 +148,16 @@ def make_force(controller: Controller | TorqueController | None, actuation: Actu
         return lambda t, terms: actuation.zero.u_tree
     torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
+    if isinstance(controller, JointServo):
+        servo, no_integral = controller, np.zeros(0)
+        return lambda t, terms: actuation.apply_tau(terms, servo.tau(t, terms, no_integral)).u_tree
     if torques:
         return lambda t, terms: actuation.apply_tau(terms, law(t, terms)).u_tree
     return lambda t, terms: apply_u(actuation, terms, law(t, terms)).u_tree
+
+
+def _with_body_forces(force: Force, forces: Sequence[BodyForce]) -> Force:
+    return lambda t, terms: force(t, terms) + generalized_force(forces, force_values(forces, t, terms), terms)
 
 
 def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:

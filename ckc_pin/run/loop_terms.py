@@ -9,13 +9,14 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.control.actuation import require_tau, require_u
-from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
+from ckc_pin.control.controllers import has_state, initial_state
+from ckc_pin.control.forces import BodyForce
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics, Partition
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["LoopTerms", "require_number", "wrap_controller", "wrap_event_function"]
+__all__ = ["LoopTerms", "require_number", "wrap_controller", "wrap_event_function", "wrap_force"]
 
 
 class _LoopTerm(lazy[Any]):
@@ -101,18 +102,44 @@ class LoopTerms(Terms):
         return self.C @ x
 
 
-def wrap_controller(controller: Controller | TorqueController, mechanism: Mechanism) -> Callable[..., Any]:
-    """Return the function that the loop calls for a controller written in Python.
+def wrap_controller(controller: Any, method: str, mechanism: Mechanism) -> Callable[..., Any]:
+    """Return the function that the loop calls for a method of a controller written in Python.
 
-    It returns u or tau, or the text of a NumericalError, at which the run stops.
+    It returns u, tau or the rate of the controller's state, or the text of a NumericalError, at which the run stops.
+
+    Parameters
+    ----------
+    controller : Controller or TorqueController
+    method : "u", "tau" or "state_dot"
+    mechanism : Mechanism
     """
-    torques = is_torque_controller(controller)
-    law: Callable[[float, Terms], Any] = getattr(controller, "tau" if torques else "u")
-    require = require_tau if torques else require_u
+    law: Callable[..., Any] = getattr(controller, method)
+    takes_state, size = has_state(controller), len(initial_state(controller))
+
+    def require(value: Any) -> Array:
+        if method != "state_dot":
+            return (require_tau if method == "tau" else require_u)(value, mechanism)
+        rate = np.asarray(value, dtype=float)
+        if rate.shape != (size,) or not np.all(np.isfinite(rate)):
+            raise InputError(f"controller: state_dot: expected {size} finite numbers, got {value!r:.80}")
+        return rate
+
+    def call(*arguments: Any) -> Any:
+        state = (arguments[0].law_state,) if takes_state else ()
+        try:
+            return require(law(arguments[2], LoopTerms(mechanism, arguments), *state))
+        except NumericalError as error:
+            return str(error)
+
+    return call
+
+
+def wrap_force(force: BodyForce, mechanism: Mechanism) -> Callable[..., Any]:
+    """Return the function that the loop calls for a force that is a function of the state."""
 
     def call(*arguments: Any) -> Any:
         try:
-            return require(law(arguments[2], LoopTerms(mechanism, arguments)), mechanism)
+            return force.values(arguments[2], LoopTerms(mechanism, arguments))
         except NumericalError as error:
             return str(error)
 

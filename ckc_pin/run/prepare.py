@@ -25,23 +25,26 @@ from ckc_pin.control.controllers import (
     require_no_memory,
 )
 from ckc_pin.control.desired import Desired
+from ckc_pin.control.forces import BodyForce, Force
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
-from ckc_pin.native.control import control_table, prescribed_table
+from ckc_pin.native.control import breakpoints_table, control_table, force_tables, prescribed_table
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
 from ckc_pin.run.checks import require_runnable, start_warnings
 from ckc_pin.run.compiled_terms import NEVER, select_library
 from ckc_pin.run.events import Event, EventFunction, build_event_functions
-from ckc_pin.run.loop_terms import wrap_controller
+from ckc_pin.run.loop_terms import wrap_controller, wrap_force
 from ckc_pin.scene.initial import Start, prescribed_velocity
 from ckc_pin.scene.parts import (
     apply_sampling,
     build_scene_actuation,
     build_scene_controller,
+    build_scene_forces,
     load_scene_mechanism,
     prescribed_motion,
 )
@@ -61,7 +64,7 @@ COLLOCATION_TOLERANCE = 1e-9
 MEMORY_CHECK_TIME = 1e-3  # of t_end
 MEMORY_CHECK_STEP = 1e-3  # of each independent coordinate: rad, or relative to the mechanism's size
 # Controllers that are functions of (t, terms), or are evaluated once a sample.
-NATIVE_CONTROLLERS = (SetPoint, Tracking, RecordedTorques, Sampled)
+NATIVE_CONTROLLERS = (SetPoint, Tracking, RecordedTorques, JointServo, Sampled)
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,7 @@ class Prepared:
     controller : Controller, TorqueController, Sampled or None
         None if the caller gives u.
     actuation : Actuation
+    forces : list of BodyForce
     events : list of EventFunction
     instants : (m,) array
         Output instants, s; empty if the caller steps.
@@ -128,6 +132,7 @@ class Prepared:
     mechanism: Mechanism
     controller: Controller | TorqueController | Sampled | None
     actuation: Actuation
+    forces: list[BodyForce]
     events: list[EventFunction]
     instants: Array
     start: Start
@@ -181,6 +186,7 @@ def prepare(
     controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
     *,
+    forces: Sequence[Force] = (),
     free: bool = False,
     profile: bool = False,
     library: Library | None = None,
@@ -195,6 +201,8 @@ def prepare(
         Replaces the scene's controller.
     events : sequence of Event
         Events in addition to the scene's.
+    forces : sequence of Force
+        Forces in addition to the scene's.
     free : bool
         Use no controller; the caller gives u step by step.
     profile : bool
@@ -220,6 +228,7 @@ def prepare(
     elif controller is not None and not isinstance(controller, Sampled):
         controller = as_controller(controller)
     actuation = build_scene_actuation(scene, mechanism)
+    body_forces = build_scene_forces(scene, mechanism, forces)
     functions = build_event_functions(scene.spec.event, events, mechanism)
     start = require_runnable(scene, mechanism, controller, actuation, free=free)
     if controller is not None and not isinstance(controller, NATIVE_CONTROLLERS):
@@ -230,12 +239,22 @@ def prepare(
         require_no_memory(controller, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
+    functions_of_time: list[Any] = [force.over_time for force in body_forces]
+    if not isinstance(controller, Sampled):
+        functions_of_time += [controller, getattr(controller, "desired", None)]
     if mechanism.prescribed:
+        motion = prescribed_motion(scene.spec.prescribed)
+        functions_of_time.append(motion)
         formulation["prescribed"] = prescribed_table(
-            mechanism,
-            prescribed_motion(scene.spec.prescribed),
-            smooth_friction=scene.spec.friction_smoothing is not None,
+            mechanism, motion, smooth_friction=scene.spec.friction_smoothing is not None
         )
+    if body_forces:
+        formulation["forces"] = force_tables(body_forces, partial(wrap_force, mechanism=mechanism))
+    if (breakpoints := breakpoints_table(functions_of_time)) is not None:
+        formulation["breakpoints"] = breakpoints
+    formulation["works"] = scene.spec.work
+    if isinstance(law := unwrap_sampled(controller), JointServo):
+        law.limit_torques(actuation.limit)
     sensitivities = None
     if set_up_sensitivities is not None:
         sensitivities = set_up_sensitivities(scene, mechanism, controller, actuation, start)
@@ -261,6 +280,7 @@ def prepare(
         mechanism=mechanism,
         controller=controller,
         actuation=actuation,
+        forces=body_forces,
         events=functions,
         instants=instants,
         start=start,

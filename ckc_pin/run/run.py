@@ -19,6 +19,7 @@ from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import describe_value, is_number, require_path
 from ckc_pin.codegen.library import explain_too_large
 from ckc_pin.control.desired import Desired
+from ckc_pin.control.forces import BodyForce, LinkForceSpec, place_forces
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
@@ -38,7 +39,7 @@ from ckc_pin.run.columns import (
 )
 from ckc_pin.run.derived import RunQuantities
 from ckc_pin.run.desired_path import DesiredPath, compute_desired_path, sample_target
-from ckc_pin.run.run_file import ARRAYS, OPTIONAL, RunMeta, read_run, write_run
+from ckc_pin.run.run_file import ARRAYS, OPTIONAL, WORKS, RunMeta, read_run, write_run
 from ckc_pin.run.state import State, recorded_state
 from ckc_pin.scene.parts import prescribed_positions
 from ckc_pin.scene.scene import describe_formulation
@@ -89,6 +90,10 @@ class Run(HasSummary):
     dissipated : (m,) array or None
         Energy dissipated by dry friction and impacts since the start, J. None without them, and with
         `friction_smoothing`, where the work of friction is not recorded.
+    works : (m, 5) array or None
+        Works of motors, dampers, friction, forces and impacts since the start, J. None unless the scene's `work` is on.
+    force_values : (m, 6 k) array or None
+        Force, N, and moment, N m, of each of k forces on links, in their axes. None without any.
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict
@@ -125,6 +130,8 @@ class Run(HasSummary):
     energy: Array
     lyapunov: Array | None
     dissipated: Array | None
+    works: Array | None
+    force_values: Array | None
     max_phi: float
     max_phi_dot: float
     events: list[dict[str, Any]]
@@ -157,8 +164,7 @@ class Run(HasSummary):
             return simulated
         overrides = plain_values(self.scene.get("parameters", {}))
         sources = Sources(self.scene_name, None, self.texts)
-        prescribed = prescribed_positions(msgspec.convert(self.scene.get("prescribed", []), list[PrescribedSpec]))
-        mechanism = build(self.texts[MECHANISM_FILE], sources, overrides, prescribed)
+        mechanism = build(self.texts[MECHANISM_FILE], sources, overrides, prescribed_positions(self.prescribed))
         for attribute in ("coordinates", "independent", "actuated"):
             names, expected = getattr(self, attribute), getattr(mechanism, attribute)
             if names != expected:
@@ -172,6 +178,16 @@ class Run(HasSummary):
                 f"{mechanism.closure.rows} rows"
             )
         return mechanism
+
+    @property
+    def prescribed(self) -> list[PrescribedSpec]:
+        """The scene's prescribed joints."""
+        return msgspec.convert(self.scene.get("prescribed", []), list[PrescribedSpec])
+
+    @cached_property
+    def placed_forces(self) -> list[BodyForce]:
+        """The forces on links, whose values are `force_values`."""
+        return place_forces(msgspec.convert(self.scene.get("force", []), list[LinkForceSpec]), self.mechanism)
 
     def summary(self) -> Summary:
         """Return a one-screen summary: final state, largest forces, energy, residual, work and events."""
@@ -194,6 +210,10 @@ class Run(HasSummary):
         rows.append(("energy start, end", f"{self.energy[0]:.9g}, {self.energy[-1]:.9g} J"))
         if self.dissipated is not None:
             rows.append(("friction, impacts took", f"{self.dissipated[-1]:.9g} J"))
+        if self.works is not None:
+            values = format_quantities(WORKS, self.works[-1], ["J"] * len(WORKS), 9)
+            rows.append(("works at the end", values))
+            rows.append(("energy minus works", f"constant to {self.energy_error:.2g} J"))
         rows.append(("largest |phi - w|", f"{self.max_phi:.2g} (its rate {self.max_phi_dot:.2g})"))
         rows += format_work(self.stats, self._suggest_compiling(mechanism))
         rows += [("event", f"t = {event['t']:.9g} s: {event['name']}") for event in self.events[:MAX_EVENTS_SHOWN]]
@@ -227,6 +247,17 @@ class Run(HasSummary):
             return ""
         return "; compiled ones are several times faster: ckc compile"
 
+    @property
+    def energy_error(self) -> float:
+        """Largest change of the energy minus the works of motors, dampers, friction, forces and impacts, J.
+
+        NaN unless the scene's `work` is on. The SPF that starts off its manifold has a balance of its own.
+        """
+        if self.works is None:
+            return np.nan
+        balance = self.energy - self.works.sum(axis=1)
+        return float(np.abs(balance - balance[0]).max())
+
     # --- access by name and by time --------------------------------------------------------------
 
     def __getitem__(self, name: str) -> Array:
@@ -239,7 +270,8 @@ class Run(HasSummary):
         name : str
             ``theta_1``, ``v.theta_1``, ``a.theta_1``, ``u.theta_1``, ``tau.MOTOR``, ``desired.theta_1``,
             ``desired.v.theta_1``, ``error.theta_1``, ``tip.x``, ``tip.v.x``, ``loop.LOOP.ROW``, ``joint.JOINT.fx``,
-            ``energy.kinetic``, ``energy.potential``, ``energy.total``, ``phi.LOOP.ROW``, ``phi.max``, ``sigma_min``.
+            ``energy.kinetic``, ``energy.potential``, ``energy.total``, ``work.motors`` and others, ``phi.LOOP.ROW``,
+            ``phi.max``, ``sigma_min``.
 
         Raises
         ------
@@ -440,6 +472,8 @@ class Run(HasSummary):
             "energy_start": float(self.energy[0]),
             "energy_end": float(self.energy[-1]),
             "dissipated": None if self.dissipated is None else float(self.dissipated[-1]),
+            "works": None if self.works is None else dict(zip(WORKS, self.works[-1].tolist(), strict=True)),
+            "energy_error": None if self.works is None else self.energy_error,
             "formulation": self.scene["formulation"],
             "epsilon": self.scene["epsilon"] if self.scene["formulation"] == "spf" else None,
             "events": self.events,

@@ -15,17 +15,18 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
-from ckc_pin.mechanism.spec import Vector3
+from ckc_pin.mechanism.spec import FrameSpec, Vector3
 from ckc_pin.scene.spec import PrescribedSpec
 
-__all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "RunMeta", "hashes_of", "read_run", "write_run"]
+__all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "WORKS", "RunMeta", "hashes_of", "read_run", "write_run"]
 
 FORMAT = 1
 MAX_BYTES = 2**31  # of an uncompressed run
 MAX_META_BYTES = 2**27  # of the JSON beside the arrays, which takes many times as much memory when it is parsed
 MAX_HEADER_BYTES = 10_000  # of an array's header; NumPy's own limit
 ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
-OPTIONAL = ("lyapunov", "dissipated")
+OPTIONAL = ("lyapunov", "dissipated", "works", "force_values")
+WORKS = ("motors", "dampers", "friction", "forces", "impacts")  # columns of `Run.works`
 OTHERS = ("coordinates", "meta")
 
 
@@ -74,7 +75,12 @@ class _Stats(msgspec.Struct):
 
 
 class _Controller(msgspec.Struct):
-    type: Literal["set_point", "tracking", "torques"]
+    type: Literal["set_point", "tracking", "joint_servo", "torques"]
+
+
+class _Force(msgspec.Struct):
+    frame: str | FrameSpec
+    axes: Literal["world", "frame"] = "world"
 
 
 class _Scene(msgspec.Struct):
@@ -83,6 +89,7 @@ class _Scene(msgspec.Struct):
     spf_coordinates: Literal["w", "z"]
     controller: _Controller | None = None
     parameters: dict[str, float | Vector3] = {}
+    force: list[_Force] = []
     prescribed: list[PrescribedSpec] = []
 
 
@@ -189,7 +196,8 @@ def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Ar
     closure = arrays["phi"].shape[1:]
     n = (len(coordinates),)
     shapes = {"t": (), "energy": (), "lyapunov": (), "dissipated": (), "phi": closure, "w": closure, "q_tree": n,
-              "v_tree": n, "u": (len(meta.independent),), "tau": (len(meta.actuated),)}  # fmt: skip
+              "v_tree": n, "u": (len(meta.independent),), "tau": (len(meta.actuated),), "works": (len(WORKS),),
+              "force_values": (6 * len(meta.scene.get("force", [])),)}  # fmt: skip
     for name, array in arrays.items():
         if array.shape != (rows, *shapes[name]) or array.dtype != np.float64 or not rows:
             raise InputError(

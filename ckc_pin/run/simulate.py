@@ -13,6 +13,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.base.validation import require_callable, require_flag
 from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
+from ckc_pin.control.forces import Force
 from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -41,6 +42,7 @@ def simulate(
     *,
     controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
     events: Sequence[Event] = (),
+    forces: Sequence[Force] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,
     profile: bool = False,
@@ -59,6 +61,8 @@ def simulate(
         `Sampled` adds others.
     events : sequence of Event, optional
         Event functions of the state, in addition to the scene's events.
+    forces : sequence of Force, optional
+        Forces and moments on links, constant or functions of (t, terms), in addition to the scene's.
     progress : callable, optional
         Called as progress(t, t_end), about every 0.05 s.
     on_output : callable, optional
@@ -84,7 +88,8 @@ def simulate(
     require_callable(progress, "simulate: progress", "a function of (t, t_end)")
     require_callable(on_output, "simulate: on_output", "a function of (t, q_tree)")
     require_flag(profile, "simulate: profile")
-    run = run_prepared(prepare(scene, controller, events, profile=profile), progress, on_output)
+    prepared = prepare(scene, controller, events, forces=forces, profile=profile)
+    run = run_prepared(prepared, progress, on_output)
     if controller is not None:
         run.scene.pop("controller", None)  # The caller's controller replaced it.
     return run
@@ -135,6 +140,7 @@ def build_run(
     scene, mechanism, loop = prepared.scene, prepared.mechanism, prepared.loop
     parts = _split_rows(prepared, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
+    works, force_values = parts.pop("works"), parts.pop("forces")
     joints, smoothing = mechanism.joints, scene.spec.friction_smoothing
     is_dissipation_known = joints.has_events(smoothing) and not joints.has_smooth_friction(smoothing)
     run = Run(
@@ -145,12 +151,14 @@ def build_run(
         actuated=mechanism.actuated,
         lyapunov=_evaluate_lyapunov(prepared, lyapunov, parts),
         dissipated=dissipated if is_dissipation_known else None,
+        works=works if scene.spec.work else None,
+        force_values=force_values if prepared.forces else None,
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=list_occurrences(prepared.events, mechanism, loop),
         stats={**loop.stats().to_dict(), "wall_s": wall_s},
         scene_name=scene.name,
-        scene=scene.to_dict(),
+        scene=_describe_scene(prepared),
         texts=prepared.texts,
         warnings=tuple(warnings),
         profile={name: {"calls": calls, "seconds": seconds} for name, (calls, seconds) in loop.profile().items()},
@@ -159,6 +167,15 @@ def build_run(
         **parts,
     )
     return run.with_warnings(run.list_speed_warnings())
+
+
+def _describe_scene(prepared: Prepared) -> dict[str, Any]:
+    """Return the scene with the caller's forces, without the values of those that are functions of the state."""
+    data = prepared.scene.to_dict()
+    of_caller = prepared.forces[len(prepared.scene.spec.force) :]
+    if of_caller:
+        data["force"] = [*data.get("force", []), *(force.to_dict() for force in of_caller)]
+    return data
 
 
 def _advance_to_end(

@@ -8,11 +8,11 @@ from os.path import exists
 from pathlib import Path
 
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.build import make_controller
-from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
+from ckc_pin.control.build import SceneController, make_controller
 from ckc_pin.control.desired import Desired, find_rate_jump, make_motion
+from ckc_pin.control.forces import BodyForce, Force, read_forces
 from ckc_pin.control.sampled import Sampled
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.spec import FeedbackSpec, SampledSpec
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.mechanism.library import mechanism_file
@@ -26,6 +26,7 @@ __all__ = [
     "apply_sampling",
     "build_scene_actuation",
     "build_scene_controller",
+    "build_scene_forces",
     "load_scene_mechanism",
     "prescribed_motion",
     "prescribed_positions",
@@ -93,7 +94,7 @@ def _resolve_path(scene: Scene, name: str) -> str | Path:
 
 def build_scene_controller(
     scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
-) -> SetPoint | Tracking | RecordedTorques | None:
+) -> SceneController | None:
     """Build a scene's controller.
 
     Parameters
@@ -133,12 +134,21 @@ def build_scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
         return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
 
 
-def apply_sampling(
-    scene: Scene, controller: SetPoint | Tracking | RecordedTorques | None
-) -> SetPoint | Tracking | RecordedTorques | Sampled | None:
+def build_scene_forces(scene: Scene, mechanism: Mechanism, forces: Sequence[Force] = ()) -> list[BodyForce]:
+    """Return the forces of a scene, and those of the caller, on the mechanism's bodies.
+
+    Raises
+    ------
+    InputError, MechanismError
+    """
+    with scene.sources.prefix_errors():
+        return read_forces(scene.spec.force, forces, mechanism, scene.sources)
+
+
+def apply_sampling(scene: Scene, controller: SceneController | None) -> SceneController | Sampled | None:
     """Return a scene's controller with the scene's sample time, delay, sensors and drives, if it is sampled."""
     spec = scene.spec.controller
-    if controller is None or not isinstance(spec, FeedbackSpec) or spec.sample_time is None:
+    if controller is None or not isinstance(spec, SampledSpec) or spec.sample_time is None:
         return controller
     with scene.sources.prefix_errors():
         return Sampled(controller, spec.sample_time, spec.delay, spec.sensor, spec.drive)

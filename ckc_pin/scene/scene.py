@@ -18,7 +18,7 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.toml import convert, find_faults, join_dotted_keys, read_text, read_toml
 from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_table, require_type, suggest_name
-from ckc_pin.control.spec import ControllerSpec, FeedbackSpec, SetPointSpec, TorquesSpec, TrackingSpec
+from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SampledSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import (
     MECHANISM_FILE,
@@ -90,6 +90,8 @@ class Scene(HasSummary):
         rows += [("with rates", rates)] if rates else []
         rows.append(("method", f"{spec.solver.method}, rtol = {spec.solver.rtol:g}"))
         rows.append(("control", _describe_controller(spec.controller)))
+        forces = [f"on {force.name or force.frame}" for force in spec.force]
+        rows += [("forces", forces)] if forces else []
         rows += [("event", f"{event.of} of {event.coordinate or 'the mechanism'}") for event in spec.event]
         return Summary(f"Scene {self.name}", rows)
 
@@ -101,6 +103,11 @@ class Scene(HasSummary):
     @cached_property
     def _packed(self) -> bytes:
         return msgspec.msgpack.encode(_drop_absent(msgspec.to_builtins(self.spec)))
+
+    def refuse_forces(self, function: str) -> None:
+        """Raise InputError if the scene has forces on links, for a function that does not support them."""
+        if self.spec.force:
+            raise InputError(f"{function}: forces on links are not supported; remove [[force]]")
 
     def output_instants(self) -> Array:
         """Return the times at which a run of this scene is recorded, shape (m,), s, from 0 to t_end.
@@ -138,6 +145,8 @@ def _describe_controller(spec: ControllerSpec | None) -> str:
     match spec:
         case None:
             return "none"
+        case JointServoSpec():
+            return f"servos of {', '.join(spec.motor)}"
         case SetPointSpec():
             return f"set point, K_P = {spec.K_P}, K_V = {spec.K_V}"
         case TrackingSpec():
@@ -300,7 +309,7 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
         )
     if spec.initial.w is not None and spec.formulation != "spf":
         raise InputError(f"{sources.name}: initial.w: only the SPF can start off phi = 0, not {spec.formulation!r}")
-    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is None:
+    if isinstance(spec.controller, SampledSpec) and spec.controller.sample_time is None:
         for key in ("delay", "sensor", "drive"):
             if getattr(spec.controller, key):
                 raise InputError(

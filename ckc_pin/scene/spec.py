@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from ckc_pin.base.toml import FileStruct
+from ckc_pin.control.forces import LinkForceSpec
 from ckc_pin.control.spec import ControllerSpec, MotionSpec
 from ckc_pin.mechanism.library import GeneratorSpec
 from ckc_pin.mechanism.spec import Name, Vector3
@@ -170,7 +171,7 @@ class SceneSpec(FileStruct, frozen=True):
         ``coriolis_velocity = "actual"``
     friction_smoothing : rad/s, m/s
         Smooth dry friction, friction * tanh(rate / friction_smoothing), instead of joints that stick. Its work is not
-        in `dissipated`.
+        in `dissipated`, but in `works`.
         ``friction_smoothing = 1e-3``
     parameters : as in the files
         Other values of the mechanism's parameters, by name (see "parameters").
@@ -187,6 +188,13 @@ class SceneSpec(FileStruct, frozen=True):
     event
         Events that are recorded, or that end the run.
         ``event = [{of = "limit", stop = true}]``
+    force
+        Forces and moments on links.
+        ``force = [{frame = "rod", force = [0.0, 0.0, -20.0]}]``
+    work
+        Integrate the works of motors, dampers, friction and forces with the motion: ``work.motors`` and others of the
+        run's quantities, and the error of the energy balance.
+        ``work = true``
     prescribed
         Joints that move as prescribed, whatever torque that takes.
         ``prescribed = [{joint = "crank", rate = 6.2832}]``
@@ -204,4 +212,6 @@ class SceneSpec(FileStruct, frozen=True):
     solver: SolverSpec = SolverSpec()
     controller: ControllerSpec | None = None
     event: list[EventSpec] = []
+    force: list[LinkForceSpec] = []
+    work: bool = False
     prescribed: list[PrescribedSpec] = []

@@ -14,7 +14,8 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.summary import HasSummary, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import describe_value, is_number, require_path
-from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
+from ckc_pin.control.build import SceneController
+from ckc_pin.control.controllers import RecordedTorques, Tracking
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.spec import FeedbackSpec
 from ckc_pin.dynamics.terms import Terms
@@ -237,7 +238,7 @@ class _Drive(NamedTuple):
     is_angle: BoolArray
 
 
-def _find_drive(law: SetPoint | Tracking | RecordedTorques | None, mechanism: Mechanism) -> _Drive | None:
+def _find_drive(law: SceneController | None, mechanism: Mechanism) -> _Drive | None:
     if isinstance(law, RecordedTorques):
         rest = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
         return _Drive("the torque over time", lambda t: law.tau(t, rest), float(law.times[-1]), np.zeros(0, bool))

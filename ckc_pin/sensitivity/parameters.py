@@ -116,6 +116,7 @@ def require_supported_scene(
             f"sensitivities: {type(controller).__name__} gives tau, whose derivatives are unknown; use a controller "
             "that gives u"
         )
+    scene.refuse_forces("sensitivities")
     if spec.formulation == "spf" and spec.spf_coordinates == "z":
         raise InputError('sensitivities support spf_coordinates = "w" only')
     if spec.initial.w is not None and any(spec.initial.w):

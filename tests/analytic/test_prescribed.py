@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import brentq
 
-from ckc_pin import CkcError, InputError, Run, Simulator, check, load, sensitivities, simulate
+from ckc_pin import CkcError, InputError, Run, Simulator, check, inverse_dynamics, load, sensitivities, simulate
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -85,6 +85,34 @@ def test_motion_and_torque_are_those_of_the_problem_with_the_joint_eliminated(fo
     assert_close(run["theta_1"], [left_crank(t)[0] for t in run.t], 1e-12)
     assert run.max_phi < 1e-12
     assert run.max_phi_dot < 1e-9
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("friction", [0.0, 0.1])
+def test_accelerations_and_loop_forces_contain_the_prescribed_motion(formulation: str, friction: float) -> None:
+    """Eq. 1 of the appendix at the recorded states, with the left crank's motion inserted by hand."""
+    parameters = {"joint.theta_1.friction": friction}
+    run = simulate("five_bar/swing", scene(formulation, parameters=parameters))
+    accelerations = np.column_stack([run[f"a.{name}"] for name in run.coordinates])
+    loop_forces, forces = run.loop_forces()["elbow"], inverse_dynamics(run)
+    assert_close(forces.a_tree, accelerations, 1e-9)
+    assert_close(forces.tau, run.tau, 1e-7)
+    for t, q_tree, v_tree, acceleration, multipliers in zip(
+        run.t, run.q_tree, run.v_tree, accelerations, loop_forces, strict=True
+    ):
+        q_dot = v_tree[[0, 2]]
+        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.C(q_tree, v_tree) @ q_dot + FIVE_BAR.h(q_tree)
+        q_1_ddot = left_crank(float(t))[2]
+        q_ddot = np.array([q_1_ddot, (-rest[1] - D[1, 0] * q_1_ddot) / D[1, 1]])
+        a_tree = FIVE_BAR.rho(q_tree) @ q_ddot + FIVE_BAR.rho_dot(q_tree, v_tree) @ q_dot
+        assert_close(acceleration, a_tree, 1e-7)
+        force = FIVE_BAR.D_tree(q_tree) @ a_tree + FIVE_BAR.C_tree(q_tree, v_tree) @ v_tree + FIVE_BAR.h_tree(q_tree)
+        assert_close(multipliers, np.linalg.solve(FIVE_BAR.J(q_tree)[:, [1, 3]].T, force[[1, 3]]), 1e-7)
+
+
+def test_inverse_dynamics_of_a_scene_with_prescribed_joints_asks_for_its_run() -> None:
+    with pytest.raises(InputError, match="give a run of the scene instead"):
+        inverse_dynamics("five_bar/swing", scene("reduced"))
 
 
 def test_a_prescribed_joint_costs_no_more_steps_than_the_eliminated_problem() -> None:

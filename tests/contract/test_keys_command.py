@@ -45,7 +45,9 @@ def test_keys_of_one_table_are_a_line_each() -> None:
         ("tracking", ['[controller] with type = "tracking"']),
         ("controller.set_point", ['[controller] with type = "set_point"']),
         ("circle", ["[controller.desired.circle]"]),
-        ("force", ["[[force]]"]),
+        ("force", ["[[force]]", "[[force]]"]),
+        ("motor", ["[[motor]]"]),
+        ("controller.motor", ["[controller.motor.NAME]"]),
     ],
 )
 def test_table_is_found_by_path_last_part_or_type(name: str, headings: list[str]) -> None:

@@ -163,7 +163,7 @@ def test_accelerations_with_friction_are_those_of_the_run() -> None:
 
 @pytest.mark.parametrize("name", ["five_bar", "delta", "two_ur5", "slider_crank"])
 def test_every_name_denotes_one_number_for_each_instant(name: str) -> None:
-    run = simulate(name, {"t_end": 0.01, "solver.output_dt": 0.005})
+    run = simulate(name, {"t_end": 0.01, "solver.output_dt": 0.005, "work": True})
     names = [key for key, _ in iterate_quantities(run.mechanism)]
     assert len(set(names)) == len(names)
     for key in names:

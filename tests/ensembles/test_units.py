@@ -128,6 +128,8 @@ def test_units_match_the_reference(scene: Path) -> None:
     compared = 0
     for file in ("mechanism", "scene"):
         for table in tables(file):
+            if file == "scene" and table.path.startswith("force"):  # entries of its list are no variables
+                continue
             path = entries.get(table.path, "" if file == "mechanism" else table.path)
             for key in table.keys:
                 if key.unit and (path or file == "scene"):

@@ -5,6 +5,7 @@
 #include <nanobind/stl/shared_ptr.h>
 
 #include "bind/control.hpp"
+#include "control/joint_servo.hpp"
 
 namespace ckc {
 
@@ -54,37 +55,67 @@ std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int siz
 
 namespace {
 
-// A user's controller. The function returns an array with u or torques, or a string that says why there is none.
-class CallbackController : public Controller {
+// A user's function, which returns an array, or a string that says why there is none.
+class Callback {
  public:
-  // `differentiates`: compute derivatives by differences; otherwise they are unknown.
-  CallbackController(nb::object function, bool outputs_torques, bool differentiates, std::shared_ptr<View> view)
-      : function_(std::move(function)),
-        outputs_torques_(outputs_torques),
-        differentiates_(differentiates),
-        view_(std::move(view)) {}
-  ~CallbackController() override {
+  Callback(nb::object function, std::shared_ptr<View> view) : function_(std::move(function)), view_(std::move(view)) {}
+  ~Callback() {
     nb::gil_scoped_acquire acquired;
     function_.reset();
   }
 
-  bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override {
+  bool operator()(const MeasuredState& at, Out values, ControlFailure& failure) const {
     nb::gil_scoped_acquire acquired;
     nb::object result;
-    t_ = at.t, v_ = at.v_tree;
     if (!view_->call(function_, at, failure, result)) return false;
-    if (read(result, u)) return true;
-    failure.message = nb::cast<std::string>(result);
-    return false;
+    if (read(result, values)) return true;
+    return failure.message = nb::cast<std::string>(result), false;
+  }
+  View& view() const { return *view_; }
+
+ private:
+  nb::object function_;
+  std::shared_ptr<View> view_;
+};
+
+class CallbackWrench : public WrenchLaw {
+ public:
+  CallbackWrench(nb::object function, const std::shared_ptr<View>& view) : wrench_(std::move(function), view) {}
+  bool evaluate(const MeasuredState& at, Out wrench, ControlFailure& failure) override {
+    return wrench_(at, wrench, failure);
+  }
+  bool depends_on_state() const override { return true; }
+
+ private:
+  Callback wrench_;
+};
+
+// A user's controller, with u or torques.
+class CallbackController : public Controller {
+ public:
+  CallbackController(const nb::dict& table, const std::shared_ptr<View>& view)
+      : u_(nb::object(table["function"]), view),
+        state_rate_(nb::object(table["state_rate"]), view),
+        initial_state_(get<Vector>(table, "initial_state")),
+        outputs_torques_(get<bool>(table, "outputs_torques")),
+        differentiates_(get<bool>(table, "differentiates")) {}
+
+  bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) override {
+    t_ = at.t, v_ = at.v_tree, u_.view().law_state = state;
+    return u_(at, u, failure);
+  }
+  Vector initial_state() const override { return initial_state_; }
+  bool state_rate(const MeasuredState& at, Out rate, ControlFailure& failure) override {
+    return state_rate_(at, rate, failure);
   }
   bool outputs_torques() const override { return outputs_torques_; }
 
-  // Central differences along each coordinate and rate of the tree, whether or not the loops allow them.
+  // With `differentiates`, central differences along each coordinate and rate of the tree, whether or not the loops allow them.
   bool derivatives(Core& core, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override {
     if (!differentiates_) return false;
     const Vector q_tree = core.q_tree, v = v_;
     const auto d = static_cast<Eigen::Index>(fixed_q.size());
-    Vector step = Vector::Zero(core.n), moved_q, moved_v, q(d), q_dot(d), moved_u(d);
+    Vector step = Vector::Zero(core.n), moved_q, moved_v, q(d), q_dot(d), moved_u(by_q.rows());
     ControlFailure failure;
     bool exists = true;
     const auto add = [&](int k, bool of_rate, double by, Matrix& derivative) {
@@ -103,7 +134,7 @@ class CallbackController : public Controller {
     };
     for (int k = 0; k < core.n; ++k)
       for (const double by : {difference, -difference}) add(k, false, by, by_q), add(k, true, by, by_v);
-    if (failure.raised) view_->raised = nullptr;
+    if (failure.raised) u_.view().raised = nullptr;
     core.set_configuration(q_tree), core.set_velocity(v);
     v_ = v;
     return exists && by_q.allFinite() && by_v.allFinite();
@@ -111,21 +142,56 @@ class CallbackController : public Controller {
 
  private:
   static constexpr double difference = 6e-6;  // rad, m, rad/s, m/s: cube root of the machine epsilon
-  nb::object function_;
+  Callback u_, state_rate_;
+  const Vector initial_state_;
   const bool outputs_torques_, differentiates_;
   double t_ = 0.0;  // of the last u
   Vector v_;
-  std::shared_ptr<View> view_;
 };
+
+Actuation actuation_from_table(const nb::dict& table, const Core& core) {
+  const auto transmission = get<Matrix>(table, "transmission");
+  const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
+             preload = get<Vector>(table, "preload");
+  const auto m = transmission.rows();
+  require(transmission.cols() == core.n && transmission.allFinite(),
+          "transmission: a finite column per coordinate is needed");
+  require(limit.size() == m && (limit.array() >= 0).all(), "limit: positive numbers are needed");
+  require(weights, m, "weights"), require(preload, m, "preload");
+  require((weights.array() > 0).all(), "weights: positive numbers are needed");
+  std::vector<std::vector<Actuation::Gear>> gears(m);
+  for (Eigen::Index k = 0; k < m; ++k)
+    for (int j = 0; j < core.n; ++j)
+      if (transmission(k, j) != 0.0) gears[k].push_back({j, transmission(k, j)});
+  return {core, std::move(gears), get<bool>(table, "direct"),
+          Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
+}
+
+std::unique_ptr<Controller> joint_servo_from_table(const nb::dict& table, const Core& core, Eigen::Index motors) {
+  std::vector<Servo> servos;
+  for (const auto& servo : get<std::vector<nb::dict>>(table, "servos")) {
+    servos.push_back({get<int>(servo, "motor"), get<int>(servo, "joint"), get<double>(servo, "gear"),
+                      get<bool>(servo, "of_rate"), get<double>(servo, "K_P"), get<double>(servo, "K_I"),
+                      get<double>(servo, "K_D"), get<double>(servo, "limit"), get<double>(servo, "unwinding")});
+    require_indices({servos.back().motor}, static_cast<int>(motors), "motor of a servo");
+    require_indices({servos.back().joint}, core.n, "joint of a servo");
+    require(servos.back().gear != 0.0, "gear of a servo: a number other than zero is needed");
+  }
+  std::unique_ptr<Actuation> gravity;
+  if (table.contains("gravity"))
+    gravity = std::make_unique<Actuation>(actuation_from_table(get<nb::dict>(table, "gravity"), core));
+  const auto size = static_cast<int>(servos.size());
+  return std::make_unique<JointServo>(std::move(servos), trajectory_from_table(get<nb::dict>(table, "desired"), size),
+                                      std::move(gravity));
+}
 
 }  // namespace
 
 std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
                                                   const std::shared_ptr<View>& view) {
   const auto kind = get<std::string>(table, "kind");
-  if (kind == "call")
-    return std::make_unique<CallbackController>(nb::object(table["function"]), get<bool>(table, "outputs_torques"),
-                                                get<bool>(table, "differentiates"), view);
+  if (kind == "call") return std::make_unique<CallbackController>(table, view);
+  if (kind == "joint_servo") return joint_servo_from_table(table, core, motors);
   if (kind == "torques") {
     const auto times = get<Vector>(table, "times");
     const auto tau = get<Matrix>(table, "tau");
@@ -141,7 +207,7 @@ std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const C
     require_square(K_P, d, "K_P"), require_square(K_V, d, "K_V"), require(q_d, d, "q_d"), require(h_d, d, "h_d");
     return std::make_unique<SetPointController>(K_P, K_V, q_d, h_d, get<double>(table, "potential"));
   }
-  require(kind == "tracking", "controller: the kind must be set_point, tracking, torques or call");
+  require(kind == "tracking", "controller: the kind must be set_point, tracking, joint_servo, torques or call");
   const auto Lambda = get<Matrix>(table, "Lambda"), K_D = get<Matrix>(table, "K_D");
   require_square(Lambda, d, "Lambda"), require_square(K_D, d, "K_D");
   std::unique_ptr<Core> model;
@@ -188,25 +254,25 @@ nb::object View::term(long stamp, const std::string& name) {
   return term_by_name(state_->core, name);
 }
 
-namespace {
-
-Actuation actuation_from_table(const nb::dict& table, const Core& core) {
-  const auto transmission = get<Matrix>(table, "transmission");
-  const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
-             preload = get<Vector>(table, "preload");
-  const auto m = transmission.rows();
-  require(transmission.cols() == core.n && transmission.allFinite(),
-          "transmission: a finite column per coordinate is needed");
-  require(limit.size() == m && (limit.array() >= 0).all(), "limit: positive numbers are needed");
-  require(weights, m, "weights"), require(preload, m, "preload");
-  require((weights.array() > 0).all(), "weights: positive numbers are needed");
-  std::vector<std::vector<Actuation::Gear>> gears(m);
-  for (Eigen::Index k = 0; k < m; ++k)
-    for (int j = 0; j < core.n; ++j)
-      if (transmission(k, j) != 0.0) gears[k].push_back({j, transmission(k, j)});
-  return {core, std::move(gears), get<bool>(table, "direct"),
-          Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
+std::unique_ptr<BodyForces> forces_from_tables(const std::vector<nb::dict>& tables, const Core& core,
+                                               const std::shared_ptr<View>& view) {
+  std::vector<BodyForce> forces;
+  for (const nb::dict& table : tables) {
+    std::unique_ptr<WrenchLaw> wrench;
+    if (table.contains("function"))
+      wrench = std::make_unique<CallbackWrench>(nb::object(table["function"]), view);
+    else
+      wrench = std::make_unique<WrenchOverTime>(trajectory_from_table(get<nb::dict>(table, "values"), 6));
+    const auto origin = get<Vector>(table, "origin");
+    const auto axes = get<Matrix>(table, "axes");
+    require(origin, 3, "origin of a force"), require_square(axes, 3, "axes of a force");
+    forces.push_back({get<int>(table, "joint"), origin, axes, get<bool>(table, "in_world"), std::move(wrench)});
+    require_indices({forces.back().joint}, core.tree.joints, "joint of a force");
+  }
+  return std::make_unique<BodyForces>(std::move(forces), core.n);
 }
+
+namespace {
 
 // `transmission` (d, motors): u = transmission tau.
 Vector allocate(MatrixArg transmission, VectorArg u, VectorArg limit, VectorArg weights, VectorArg preload) {
@@ -244,7 +310,7 @@ std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& c
     const auto clock = get<nb::dict>(table, "clock");
     Sampling& sampling = control->sampling.emplace();
     sampling.period = get<double>(clock, "period"), sampling.delay = get<double>(clock, "delay");
-    sampling.times = get<Vector>(clock, "times"), sampling.holds_output = get<bool>(clock, "holds_output");
+    sampling.times = get<Vector>(clock, "times");
   }
   if (table.contains("sensor")) control->sensor = sensor_from_table(get<nb::dict>(table, "sensor"), core);
   if (table.contains("drive")) {

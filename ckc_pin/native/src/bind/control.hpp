@@ -6,6 +6,7 @@
 
 #include "bind/checks.hpp"
 #include "control/control.hpp"
+#include "control/forces.hpp"
 
 namespace ckc {
 
@@ -18,6 +19,7 @@ class View : public std::enable_shared_from_this<View> {
   // Return a term by name; None after the call has ended.
   nb::object term(long stamp, const std::string& name);
 
+  Vector law_state;  // state of the control law
   long calls = 0;
   bool term_requested = false;  // whether a callback has asked for a term
   std::exception_ptr raised;    // exception of the last call
@@ -35,6 +37,8 @@ class View : public std::enable_shared_from_this<View> {
 std::unique_ptr<Controller> controller_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
                                                   const std::shared_ptr<View>& view);
 std::unique_ptr<Trajectory> trajectory_from_table(const nb::dict& table, int size);
+std::unique_ptr<BodyForces> forces_from_tables(const std::vector<nb::dict>& tables, const Core& core,
+                                               const std::shared_ptr<View>& view);
 void bind_allocation(nb::module_& m);
 std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& core, const std::shared_ptr<View>& view);
 

@@ -27,12 +27,25 @@ void require_state(const Linearization& linearization, In q_tree, In v_tree, In 
   require_indices(locked, core.n, "locked");
 }
 
-// Return the linearization at one state; None if J has lost rank.
+// Return the linearization at one state under u' and forces on links; None if J has lost rank.
 std::optional<nb::typed<nb::dict, nb::str, nb::any>> linearize(Linearization& linearization, VectorArg q_tree,
                                                                VectorArg v_tree, VectorArg u_tree,
-                                                               const Indices& locked) {
+                                                               const Indices& locked,
+                                                               const std::vector<nb::dict>& forces) {
   require_state(linearization, q_tree, v_tree, u_tree, locked);
-  if (!linearization.compute(q_tree, v_tree, u_tree, locked)) return {};
+  Core& core = *linearization.core;
+  Vector force = u_tree;
+  Matrix force_by_q;
+  if (!forces.empty()) {
+    const auto on_links = forces_from_tables(forces, core, nullptr);
+    const Vector none;
+    ControlFailure failure;
+    core.set_configuration(q_tree);
+    on_links->compute({0.0, core, none, none, none, none}, failure);
+    force += on_links->value, force_by_q.setZero(core.n, core.n);
+    require(on_links->add_derivative(core, force_by_q), "forces: constant ones are needed");
+  }
+  if (!linearization.compute(q_tree, v_tree, force, locked, force_by_q)) return {};
   linearization.solve_multipliers();
   nb::typed<nb::dict, nb::str, nb::any> result;
   result["at"] = linearization.coordinates, result["T"] = linearization.T, result["V"] = linearization.V,
@@ -88,7 +101,10 @@ class Feedback {
 void bind_linearization(nb::module_& m) {
   nb::class_<Linearization>(m, "Linearization", "Linearizes eq. 1 at one state after another.")
       .def(nb::new_(&linearization_from_table), "core"_a, "transmission"_a)
-      .def("at", &linearize, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a,
+      .def("at", &linearize, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a, "forces"_a,
+           nb::sig("def at(self, q_tree: numpy.typing.NDArray[numpy.float64], v_tree: "
+                   "numpy.typing.NDArray[numpy.float64], u_tree: numpy.typing.NDArray[numpy.float64], "
+                   "locked: list[int], forces: list[dict[str, typing.Any]]) -> dict[str, typing.Any] | None"),
            "Return the linearization at one state; None if J has lost rank.")
       .def("seconds", &seconds, "q_tree"_a, "v_tree"_a, "u_tree"_a, "rounds"_a);
   nb::class_<Feedback>(m, "Feedback", "A controller with its motors, evaluated and differentiated at one state.")

@@ -86,6 +86,14 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   if (formulation.contains("prescribed"))
     system->prescribe(prescribed_from_table(get<nb::dict>(formulation, "prescribed"), *loop.core,
                                             owned_control->tau.size()));
+  if (formulation.contains("forces"))
+    system->set_forces(
+        forces_from_tables(get<std::vector<nb::dict>>(formulation, "forces"), *loop.core, loop.view));
+  if (formulation.contains("breakpoints")) {
+    const auto breakpoints = get<nb::dict>(formulation, "breakpoints");
+    system->set_breakpoints({get<Vector>(breakpoints, "times"), get<double>(breakpoints, "tolerance")});
+  }
+  if (get<bool>(formulation, "works")) system->integrate_works();
   std::unique_ptr<SensitivityIntegrand> sensitivities;
   if (formulation.contains("sensitivities"))
     sensitivities = std::make_unique<SensitivityIntegrand>(
@@ -291,6 +299,8 @@ double seconds(Loop& loop, MatrixArg states, int rounds, bool of_jacobian) {
 
 void bind_loop(nb::module_& m) {
   nb::class_<View>(m, "View", "The state of the loop during a callback.")
+      .def_prop_ro(
+          "law_state", [](const View& view) { return view.law_state; }, "State of the control law.")
       .def("term", &View::term, "stamp"_a, "name"_a, nb::sig("def term(self, stamp: int, name: str) -> typing.Any"));
   bind_types(m), bind_allocation(m);
   nb::class_<Loop> binding(m, "Loop", "The step loop of a mechanism with its controller, events and record.");

@@ -163,6 +163,7 @@ Control::Control(const Core& core, Actuation actuation) : actuation_(std::move(a
 }
 
 void Control::start() {
+  if (law) law->state = law->initial_state();
   if (!sampling) return;
   sampling->next_sample = 0, sampling->queue_size = 0;
   constant_is_torque = drive || (law && law->outputs_torques());
@@ -170,11 +171,6 @@ void Control::start() {
   sample_ = constant;
   if (sensor) sensor->reset();
   if (drive) drive->output.setZero(tau.size());
-  start_segment(-std::numeric_limits<double>::infinity(), sampling->time_tolerance(0.0));
-}
-
-void Control::start_segment(double t, double tolerance) {
-  if (law && !sampling->holds_output) law->set_segment(t, sampling->next_sample_time(), tolerance);
 }
 
 bool Control::set_constant(In value, bool outputs_torques) {
@@ -186,7 +182,7 @@ bool Control::set_constant(In value, bool outputs_torques) {
 bool Control::needs_fixed_partition() const {
   if (!is_active()) return false;
   if (!law) return !constant_is_torque;
-  return law->needs_terms() || !(actuation_.is_direct || law->outputs_torques());
+  return law->needs_fixed_partition() || !(actuation_.is_direct || law->outputs_torques());
 }
 
 MeasuredState Control::in_fixed_partition(const MeasuredState& at) {
@@ -223,7 +219,7 @@ bool Control::derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force)
   force = u_tree;
   u_by_q_.setZero(u.size(), n), u_by_v_.setZero(u.size(), n);
   limited_motors.exist = false;
-  if (!is_active() || outputs_torques()) return !is_feedback() || law->derivatives(core, fixed_q_, u_by_q_, u_by_v_);
+  if (!is_active() || outputs_torques()) return !is_feedback() || torque_derivatives(core, by_q, by_v);
   limited_motors.exist =
       !actuation_.is_direct && !((u - requested_).norm() <= max_relative_u_error * requested_.norm());
   if (limited_motors.exist && actuation_.is_redundant()) return false;
@@ -235,6 +231,21 @@ bool Control::derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force)
   }
   for (Eigen::Index i = 0; i < u.size(); ++i)
     if (responds(i)) by_q.row(fixed_q_[i]) = u_by_q_.row(i), by_v.row(fixed_q_[i]) = u_by_v_.row(i);
+  return true;
+}
+
+bool Control::torque_derivatives(Core& core, Matrix& by_q, Matrix& by_v) {
+  const auto n = u_tree.size();
+  Matrix tau_by_q = Matrix::Zero(tau.size(), n), tau_by_v = tau_by_q;
+  if (!law->derivatives(core, fixed_q_, tau_by_q, tau_by_v)) return false;
+  for (size_t k = 0; k < actuation_.gears.size(); ++k) {
+    const auto motor = static_cast<Eigen::Index>(k);
+    if (is_at_limit(motor)) continue;
+    for (const Actuation::Gear& gear : actuation_.gears[k]) {
+      by_q.row(gear.joint) += gear.ratio * tau_by_q.row(motor);
+      by_v.row(gear.joint) += gear.ratio * tau_by_v.row(motor);
+    }
+  }
   return true;
 }
 
@@ -322,6 +333,11 @@ bool Control::evaluate_sample(const MeasuredState& at) {
   const bool torques = law->outputs_torques();
   Vector& output = drive && !torques ? requested_u_ : sample_;
   if (!law->compute_u(state, output, failure) || !check_finite(output)) return false;
+  if (law->state.size()) {  // the state is held with the output
+    law_rate_.resize(law->state.size());
+    if (!law->state_rate(state, law_rate_, failure)) return false;
+    law->state += sampling->period * law_rate_;
+  }
   if (!drive) return true;
   if (torques)
     actuation_.clamp(sample_);
@@ -337,15 +353,10 @@ bool Control::sample(const MeasuredState& at, bool& changed) {
   const double now = at.t + sampling->time_tolerance(at.t);
   const double sample = sampling->next_sample_time();
   if (sample <= now) {
-    if (sampling->holds_output) {
-      if (!evaluate_sample(at)) return false;
-      ++sampling->samples_taken;
-      sampling->queue_output(sample + sampling->delay, sample_);
-    } else {
-      changed = true;
-    }
+    if (!evaluate_sample(at)) return false;
+    ++sampling->samples_taken;
+    sampling->queue_output(sample + sampling->delay, sample_);
     ++sampling->next_sample;
-    start_segment(sample, sampling->time_tolerance(sample));
   }
   for (; sampling->queue_size && sampling->queue[sampling->queue_begin].first <= now; --sampling->queue_size) {
     const Vector& value = sampling->queue[sampling->queue_begin].second;

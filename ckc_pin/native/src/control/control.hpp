@@ -11,25 +11,10 @@
 
 #include "control/allocation.hpp"
 #include "control/desired.hpp"
+#include "control/measured_state.hpp"
 #include "control/sensor.hpp"
 
 namespace ckc {
-
-// The state that a controller sees: the core at that state with its terms, and q and q_dot of the user's partition.
-struct MeasuredState {
-  double t;
-  Core& core;
-  const Vector &q, &q_dot;
-  const Vector& v_tree;  // velocity at which C is evaluated
-  const Vector& rate;    // q_dot of the core's partition
-};
-
-// Why a controller has no u.
-struct ControlFailure {
-  std::string message;
-  Vector u;             // the controller's output, if it is not finite
-  bool raised = false;  // the callback raised an exception, which the bindings have stored
-};
 
 class Controller {
  public:
@@ -37,14 +22,21 @@ class Controller {
   // Compute eq. 6's force u, or motor torques. If there is none, return false and set `failure`.
   virtual bool compute_u(const MeasuredState& at, Out u, ControlFailure& failure) = 0;
   virtual bool outputs_torques() const { return false; }
+  // State of the law itself, such as the integral of an error: its initial value, its present one, which the caller
+  // sets, and its rate where u was computed last. Empty if the law has none.
+  virtual Vector initial_state() const { return {}; }
+  Vector state;
+  virtual bool state_rate(const MeasuredState&, Out /*rate*/, ControlFailure&) { return true; }
   // Times from now on lie in [begin, end], see Trajectory.
   virtual void set_segment(double /*begin*/, double /*end*/, double /*tolerance*/) {}
   // Value of the Lyapunov function, NaN if there is none. `w`: present value of phi.
   virtual double lyapunov(const MeasuredState&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it uses terms in the fixed partition, not only q and q_dot.
   virtual bool needs_terms() const { return true; }
-  // Derivatives of the last u with respect to q' (tangent) and v', at the core's state. The matrices are zero on entry.
-  // False if unknown.
+  // Whether the output depends on the choice of q.
+  virtual bool needs_fixed_partition() const { return needs_terms(); }
+  // Derivatives of the last output (u, or motor torques) with respect to q' (tangent) and v', at the core's state. The
+  // matrices are zero on entry. False if unknown.
   virtual bool derivatives(Core&, const Indices& /*fixed_q*/, Matrix& /*by_q*/, Matrix& /*by_v*/) { return false; }
   // Directional derivative of u with respect to the gains (of positions, of rates); requires `derivatives`.
   virtual void gain_derivative(const MeasuredState&, const Matrix&, const Matrix&, Out derivative) {
@@ -136,8 +128,6 @@ class Actuation {
 struct Sampling {
   double period = 0.0, delay = 0.0;
   Vector times;  // sample times, if they are not periodic
-  // False: no hold. The control is piecewise smooth. It or its derivatives jump at the instants.
-  bool holds_output = true;
   long next_sample = 0;                        // index of the next sample
   int samples_taken = 0, outputs_applied = 0;  // at the last instant
   // ring buffer of outputs waiting for their delay: (time, u)
@@ -195,7 +185,9 @@ class Control {
   // whether motor torques are prescribed
   bool outputs_torques() const { return is_feedback() ? law->outputs_torques() : constant_is_torque; }
   // Whether u depends on the state between samples.
-  bool is_feedback() const { return law && !(sampling && sampling->holds_output); }
+  bool is_feedback() const { return law && !sampling; }
+  // Rate of the law's state where the control was computed last.
+  bool law_rate(const MeasuredState& at, Out rate) { return law->state_rate(in_fixed_partition(at), rate, failure); }
   bool compute(const MeasuredState& at);
   // At an instant of the clock: take a sample that is due, and apply the outputs whose delay has elapsed.
   bool sample(const MeasuredState& at, bool& changed);
@@ -205,13 +197,14 @@ class Control {
  private:
   bool evaluate_law(const MeasuredState& at, Out u);
   bool evaluate_sample(const MeasuredState& at);  // sets sample_
-  void start_segment(double t, double tolerance);  // until the next instant, if nothing is held
   bool check_finite(In u);                        // stores u in `failure` if it is not finite
   MeasuredState in_fixed_partition(const MeasuredState& at);
+  bool torque_derivatives(Core& core, Matrix& by_q, Matrix& by_v);
   bool limited_motor_derivatives(Core& core, Matrix& by_q, Matrix& by_v);
   Actuation actuation_;
   const Indices fixed_q_;  // q of the user's partition
   Vector sample_, requested_u_, requested_force_, q_, q_dot_, requested_;
+  Vector law_rate_;
   Matrix u_by_q_, u_by_v_, to_fixed_q_;
 };
 

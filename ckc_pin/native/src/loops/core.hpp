@@ -110,6 +110,7 @@ class Core {
   // Prescribed motion of rows at the present time. `set_configuration` uses its value. Empty if all rows are constant.
   RowMotion row_motion;
   bool has_row_motion() const { return row_motion.value.size() > 0; }
+  const Tree& placed_tree() { return update_tree(), tree; }  // with the placements of all joints and the Jacobian
   double tolerance_scale() const { return tree.tolerance_scale(q_tree, scales.columns); }
   // Incremented by `set_configuration`. A caller that remembers it can tell whether the core has moved.
   long configuration_count = 0;

@@ -16,12 +16,12 @@ Linearization::Linearization(std::unique_ptr<Core> core_, Matrix transmission_)
   acceleration.a.setZero(core->n), residual_.setZero(core->constraints.closure.rows);
 }
 
-bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked) {
+bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked, const Matrix& u_by_q) {
   Core& c = *core;
   c.joints.locked = locked;
   c.set_configuration(q_tree, true), c.set_velocity(v);
-  constant_force_ = u_tree, residual_.setZero();
-  force_ = {u_tree, {}, {}};
+  u_tree_ = u_tree, u_by_q_ = u_by_q, residual_.setZero();
+  force_ = {u_tree, u_by_q, {}};
   if (!c.acceleration_derivatives(c.q_tree, v, residual_, force_, acceleration, true) || !find_basis()) return false;
   compute_velocity_dependence(v), assemble_A_B(v);
   return true;
@@ -180,7 +180,7 @@ void Linearization::solve_multipliers() {
     for (Eigen::Index k = 0; k < x.cols(); ++k) c.multiply_D_tree(x.col(k), product.col(k));
     return product;
   };
-  Vector residual = constant_force_, friction_derivative = Vector::Zero(n), v = c.v_tree;
+  Vector residual = u_tree_, friction_derivative = Vector::Zero(n), v = c.v_tree;
   c.joints.add_friction_force(v, residual), c.joints.add_friction_derivative(v, friction_derivative);
   residual = D_times(acceleration.a) + c.bias_tree - c.damping_tree - residual;
   const Vector all_multipliers = inverse.transpose() * residual;
@@ -189,6 +189,7 @@ void Linearization::solve_multipliers() {
   c.derivatives.compute(c.q_tree, v, acceleration.a, lambda);
   const Matrix minimum_norm = inverse.leftCols(m).transpose();
   lambda_q = minimum_norm * (of_q + c.derivatives.force_by_q);
+  if (u_by_q_.size()) lambda_q -= minimum_norm * u_by_q_;
   lambda_v = minimum_norm * (of_v + c.derivatives.force_by_v - Matrix(friction_derivative.asDiagonal()));
   lambda_u = minimum_norm * (of_u - Matrix::Identity(n, n));
   if (rank == J.rows()) return;

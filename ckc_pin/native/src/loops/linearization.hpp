@@ -15,9 +15,9 @@ class Linearization {
   // `transmission`: motor rates per coordinate rate, (motors, n).
   Linearization(std::unique_ptr<Core> core, Matrix transmission);
 
-  // Linearize at (q', v') under the constant u' and smooth friction. `locked` coordinates do not move. False if J has
-  // lost rank.
-  bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked);
+  // Linearize at (q', v') under u' and smooth friction. `u_by_q`: derivative of u' with respect to q' (tangent), empty
+  // if it is constant. `locked` coordinates do not move. False if J has lost rank.
+  bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked, const Matrix& u_by_q = {});
   // After `compute`: the acceleration, minimum-norm multipliers, and the multipliers' derivatives.
   void solve_multipliers();
 
@@ -39,9 +39,9 @@ class Linearization {
   void compute_velocity_dependence(In v);
   void assemble_A_B(In v);
 
-  Matrix rate_by_q_;
+  Matrix rate_by_q_, u_by_q_;
   AppliedForce force_;
-  Vector constant_force_, residual_;
+  Vector u_tree_, residual_;
   bool uses_rho_ = false;  // whether T is rho
 };
 

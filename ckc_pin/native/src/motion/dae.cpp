@@ -55,10 +55,10 @@ bool Dae::motion_rhs(double t, In y, Out y_dot) {
   const auto v = y.tail(core.n);
   v_tree = v;
   // Compiled terms give the acceleration without setting the core.
-  if (core.compiled && core.joints.locked.empty() && !control.needs_terms() && !is_stabilized()) {
+  if (core.compiled && core.joints.locked.empty() && !force_needs_core() && !is_stabilized()) {
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
-    const bool has_force = control.is_active() || core.joints.exerts_force();
+    const bool has_force = has_applied_force();
     if (has_force && !compute_forces(t, q_tree_, v)) return false;
     if (core.compiled_acceleration(q_tree_, v, has_force ? applied_force(v) : no_force_, row_correction_,
                                    y_dot.tail(core.n))) {
@@ -116,7 +116,7 @@ bool Dae::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   q_tree_ = y.head(nq);
   core.tree.normalize(q_tree_);
   const auto v = y.tail(n);
-  if (!core.compiled || !core.joints.locked.empty() || control.needs_terms() || is_stabilized() ||
+  if (!core.compiled || !core.joints.locked.empty() || force_needs_core() || is_stabilized() ||
       core.has_row_motion())
     set_core_configuration(y), core.set_velocity(v);
   if (!compute_forces(t, q_tree_, v)) return false;
@@ -223,7 +223,7 @@ bool Dae::reduce_to_freedoms(In y, Matrix& jacobian) {
   return true;
 }
 
-bool Dae::sync_core(double t, In y) {
+bool Dae::sync_motion(double t, In y) {
   if (!set_time(t)) return false;
   if (projects_) {
     if (!project_onto_manifold(y)) return false;
@@ -244,7 +244,7 @@ bool Dae::sync_core_at_start(double t, In y) {
 
 void Dae::move_core_to_last_rhs(In y) {
   set_core_configuration(y);
-  v_tree = velocity_in(y);
+  velocity = v_tree = velocity_in(y);
 }
 
 bool Dae::sync_core_at_last_rhs(double t, In y) {
@@ -255,7 +255,7 @@ bool Dae::sync_core_at_last_rhs(double t, In y) {
   return true;
 }
 
-bool Dae::sync_core_unprojected(double t, In y) {
+bool Dae::sync_motion_unprojected(double t, In y) {
   if (!set_time(t) || !set_core_configuration(y)) return false;
   velocity = v_tree = velocity_in(y);
   set_q_and_q_dot(core.q_tree, velocity);

@@ -12,10 +12,10 @@ class Dae : public System {
   Dae(Core& core, Control& control, double tolerance, bool projects, double alpha, double beta);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool sync_core(double t, In y) override;
+  bool sync_motion(double t, In y) override;
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
-  bool sync_core_unprojected(double t, In y) override;
+  bool sync_motion_unprojected(double t, In y) override;
   bool read_from_state(In y, int k, bool of_rate, double& value) const override;
   void write_projected_state(Out y) const override;
   bool set_core_configuration(In y) override;

@@ -9,7 +9,7 @@ constexpr double rounding = 1e-13;  // of the energy, relative to |kinetic| + |p
 double EnergyMonitor::energy(System& system) {
   Core& core = system.core;
   const bool dissipates = core.springs.has_damping || core.joints.exerts_force();
-  if (!system.conserves_energy() || system.control.is_active() || dissipates) return std::nan("");
+  if (!system.conserves_energy() || system.control.is_active() || system.forces() || dissipates) return std::nan("");
   const Energy energy = core.energy(system.velocity, momentum_);
   size_ = energy.kinetic + std::abs(energy.potential);
   return energy.total();

@@ -152,9 +152,9 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
 
 bool LevelSet::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if ((on_manifold_ || !actual_) && exact_jacobian(t, y, jacobian)) return true;
-  project_to_rounding_ = true;  // rhs_tolerance_ is much larger than the difference step
+  project_exactly(true);
   const bool exists = System::motion_jacobian(t, y, jacobian, evaluations);
-  project_to_rounding_ = false;
+  project_exactly(false);
   return exists;
 }
 

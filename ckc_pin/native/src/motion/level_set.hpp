@@ -14,7 +14,7 @@ class LevelSet : public System {
   LevelSet(Core& core, Control& control, double epsilon, bool actual, double tolerance, double rhs_tolerance);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool sync_core(double t, In y) override { return project_state(t, y, tolerance_); }
+  bool sync_motion(double t, In y) override { return project_state(t, y, tolerance_); }
   bool sync_core_at_start(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override;
   bool read_from_state(In y, int k, bool of_rate, double& value) const override;
@@ -39,6 +39,7 @@ class LevelSet : public System {
  private:
   bool motion_rhs(double t, In y, Out y_dot) override;
   bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
+  void project_exactly(bool on) override { project_to_rounding_ = on; }  // rhs_tolerance_ exceeds difference steps
   void update_w(double t);
   void predict_from_accepted();
   void reset_coordinates(In q_tree);  // chart, predictor and margins for the core's partition

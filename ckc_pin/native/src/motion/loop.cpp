@@ -53,6 +53,7 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   system->counts = {}, system->failure = RhsFailure::none;
   control->failure = {};
   control->start();
+  system->start_segment(t);
   reset_joints();
   start_state();
   now.t_old = now.t, now.y_old = now.y, now.h = 0.0;
@@ -67,6 +68,7 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
 
 void StepLoop::start_state() {
   system->start(start_.t, start_.q_tree, start_.v_tree, start_.w, now.y);
+  system->start_appended(now.y);
   if (integrand) integrand->start(start_.q_tree, start_.v_tree, now.y);
   now.t = start_.t;
 }
@@ -102,7 +104,7 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
       return {Stop::coordinates_singular, now.t, system->coordinate_margin()};
     if (changed) state_is_accepted_ = false, state_changed();
   }
-  may_step_beyond_ = !final && !control->law && events.is_empty();
+  may_step_beyond_ = !final && !control->law && !std::isfinite(system->next_breakpoint()) && events.is_empty();
   // Reach as far beyond as the last calls advanced without a change. `advances_unchanged_` is zero if the partition was
   // just restored.
   if (!continues)
@@ -110,18 +112,22 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
                         ? static_cast<double>(advances_unchanged_ - 1) * (until - from)
                         : 0.0;
   for (;;) {
-    const double time_tolerance = control->sampling ? control->sampling->time_tolerance(now.t) : 0.0;
-    if (control->sampling && control->sampling->next_instant() <= now.t + time_tolerance)
+    if (system->next_breakpoint() <= now.t + system->breakpoint_tolerance())
+      system->start_segment(now.t), state_changed();
+    const bool is_sampled = control->sampling.has_value();
+    const double time_tolerance =
+        std::max(is_sampled ? control->sampling->time_tolerance(now.t) : 0.0, system->breakpoint_tolerance());
+    if (is_sampled && control->sampling->next_instant() <= now.t + time_tolerance)
       if (const auto stop = sample_control()) return *stop;
-    record_until_ = control->sampling ? std::min(until, control->sampling->next_instant()) - time_tolerance : until;
+    const double next_instant =
+        std::min(is_sampled ? control->sampling->next_instant() : infinity, system->next_breakpoint());
+    record_until_ = std::isfinite(next_instant) || is_sampled ? std::min(until, next_instant) - time_tolerance : until;
     while (recorder.is_due(now.t + time_tolerance)) {
       if (!recorder.add(*system, recorder.next_instant(), now.y)) return output_failure();
       recorder.advance_instant();
     }
     if (!(now.t < until)) return {Stop::end, now.t};
-    double bound = until;
-    if (control->sampling && control->sampling->next_instant() < until - time_tolerance)
-      bound = control->sampling->next_instant();
+    const double bound = next_instant < until - time_tolerance ? next_instant : until;
     if (bound + reach_beyond_ != segment_end_)
       choose_explicit_method(bound + reach_beyond_), segment_end_ = bound + reach_beyond_;
     if (const auto stop = prepare_step(bound + reach_beyond_)) return *stop;

@@ -44,10 +44,9 @@ void StepLoop::choose_explicit_method(double bound) {
 
 // Expected duration of the present segment: until the bound, or the mean of the previous segments between joint
 // transitions, but at least the time since the last one.
-// Instants without a hold hardly excite decayed modes, so they do not end a segment.
+// Breakpoints hardly excite decayed modes, so they do not end a segment.
 double StepLoop::segment_duration(double bound) const {
-  const bool is_smooth = control->sampling && !control->sampling->holds_output;
-  const double remaining = (is_smooth ? std::max(bound, target_) : bound) - now.t;
+  const double remaining = (control->sampling ? bound : std::max(bound, target_)) - now.t;
   return joint_segments_ ? std::min(remaining, std::max((now.t - start_.t) / static_cast<double>(joint_segments_),
                                                         now.t - joint_modes_time_))
                          : remaining;
@@ -56,10 +55,12 @@ double StepLoop::segment_duration(double bound) const {
 // Consider the present segment only: a joint transition excites modes that had decayed, and they must be resolved
 // again.
 bool StepLoop::motion_is_stiff(double bound) {
+  if (!system->core.d) return false;  // only prescribed joints move
   Matrix jacobian;
   ++work.jacobians;
-  return system->jacobian(now.t, now.y, jacobian, work.rhs) && system->reduce_to_freedoms(now.y, jacobian) &&
-         is_stiff(jacobian, segment_duration(bound));
+  if (!system->jacobian(now.t, now.y, jacobian, work.rhs)) return false;
+  jacobian.conservativeResize(system->motion_size, system->motion_size);
+  return system->reduce_to_freedoms(now.y, jacobian) && is_stiff(jacobian, segment_duration(bound));
 }
 
 // A motion may become stiff after its start.

@@ -30,7 +30,7 @@ void PrintedSpf::set_state(double t, In y) {
 }
 
 // The velocity uses the exact w: the error of phi within the tolerance would be divided by epsilon.
-bool PrintedSpf::sync_core(double t, In y) {
+bool PrintedSpf::sync_motion(double t, In y) {
   if (!y.allFinite()) return false;
   set_state(t, y);
   core.multiply_rho(q_dot, velocity);

@@ -10,7 +10,7 @@ class PrintedSpf : public System {
   PrintedSpf(Core& core, Control& control, double epsilon, bool actual);
 
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
-  bool sync_core(double t, In y) override;
+  bool sync_motion(double t, In y) override;
   bool sync_core_at_last_rhs(double t, In y) override { return sync_core(t, y); }
   double coordinate_margin() override { return phi_z_margin(); }
   Accepted accept_step(double t, Out y, double margin) override;

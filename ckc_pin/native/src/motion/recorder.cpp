@@ -22,6 +22,8 @@ static std::vector<RecordColumns> columns_of(const System& system) {
       {"lyapunov", 1},
       {"max_phi", 1},
       {"max_phi_dot", 1},
+      {"forces", system.forces() ? system.forces()->wrenches.size() : 0},
+      {"works", system.integrates_works() ? work_count + 1 : 0},  // those of `WorkOf`, then of impacts
       {"extra", system.integrand ? system.integrand->record_size() : 0},
   };
   std::vector<RecordColumns> columns;
@@ -77,6 +79,8 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
                                                              (core.has_row_motion() ? core.row_motion.rate(i) : 0.0)));
   }
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
+  if (system.forces()) append(system.forces()->wrenches);
+  if (system.integrates_works()) append(system.works(y)), row(at++) = -core.joints.impact_loss;
   if (system.integrand) system.integrand->fill_record(y, row.tail(width - at));
   return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }

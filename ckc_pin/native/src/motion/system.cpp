@@ -9,6 +9,7 @@ constexpr double difference_step = 1.5e-8;  // of forward differences, relative 
 
 System::System(Core& core_, Control& control_, int motion_size_)
     : core(core_), control(control_), motion_size(motion_size_), size(motion_size_) {
+  law_size_ = control.is_feedback() ? static_cast<int>(control.law->initial_state().size()) : 0, size += law_size_;
   velocity.setZero(core.n), v_tree.setZero(core.n), w.setZero(core.constraints.closure.rows);
   q.setZero(core.d), q_dot.setZero(core.d);
   applied_force_.setZero(core.n), row_correction_.setZero(core.constraints.closure.rows),
@@ -16,8 +17,36 @@ System::System(Core& core_, Control& control_, int motion_size_)
 }
 
 void System::append(Integrand& appended) {
-  integrand = &appended, size = motion_size + appended.size();
+  integrand = &appended, size = coupled_size() + appended.size();
   crosses_singularities = false;  // sensitivities diverge at singular positions
+}
+
+void System::integrate_works() {
+  work_size_ = work_count, size = coupled_size();
+  crosses_singularities = false;  // collocation steps integrate the motion alone
+}
+
+void System::start_appended(Out y) {
+  if (law_size_) y.segment(motion_size, law_size_) = control.law->initial_state();
+  y.segment(motion_size + law_size_, work_size_).setZero();
+}
+
+double System::next_breakpoint() const {
+  return passed_breakpoints_ < breakpoints_.times.size() ? breakpoints_.times(passed_breakpoints_)
+                                                         : std::numeric_limits<double>::infinity();
+}
+
+void System::start_segment(double t) {
+  const double tolerance = breakpoints_.tolerance, *first = breakpoints_.times.data(),
+               *last = first + breakpoints_.times.size();
+  passed_breakpoints_ = std::upper_bound(first, last, t + tolerance) - first;
+  const double begin = passed_breakpoints_ ? breakpoints_.times(passed_breakpoints_ - 1)
+                                           : -std::numeric_limits<double>::infinity(),
+               end = next_breakpoint();
+  if (control.is_feedback()) control.law->set_segment(begin, end, tolerance);
+  if (has_prescribed_joints()) prescribed_.trajectory->set_segment(begin, end, tolerance);
+  if (forces_) forces_->set_segment(begin, end, tolerance);
+  row_time_ = std::numeric_limits<double>::quiet_NaN();
 }
 
 void System::prescribe(PrescribedJoints joints) {
@@ -62,17 +91,64 @@ bool System::set_prescribed_torques(double t, Out tau) {
 }
 
 bool System::rhs(double t, In y, Out y_dot) {
-  return set_time(t) && motion_rhs(t, y.head(motion_size), y_dot.head(motion_size)) &&
+  return coupled_rhs(t, y, y_dot) && (!work_size_ || powers(t, y, y_dot.segment(motion_size + law_size_, work_size_))) &&
          (!integrand || integrand->rates(y, y_dot));
 }
 
+// The motion and the state of the control law.
+bool System::coupled_rhs(double t, In y, Out y_dot) {
+  if (!set_time(t)) return false;
+  read_law_state(y);
+  if (!motion_rhs(t, y.head(motion_size), y_dot.head(motion_size))) return false;
+  return !law_size_ || control.law_rate(measured(t), y_dot.segment(motion_size, law_size_)) ||
+         fail(RhsFailure::no_control);
+}
+
+// Powers at the state of the last right-hand side.
+bool System::powers(double t, In y, Out power) {
+  move_core_to_last_rhs(y);
+  core.set_velocity(v_tree);
+  power.setZero();
+  double &motors = power(int(WorkOf::motors)), &friction = power(int(WorkOf::friction));
+  motors = control.u_tree.dot(v_tree);
+  if (core.springs.has_damping) core.compute_bias(), power(int(WorkOf::dampers)) = core.damping_tree.dot(v_tree);
+  if (core.joints.exerts_force()) {
+    applied_force_.setZero();
+    core.joints.add_friction_force(v_tree, applied_force_);
+    friction = applied_force_.dot(v_tree);
+  }
+  if (forces_) power(int(WorkOf::forces)) = forces_->value.dot(v_tree);
+  if (!has_prescribed_joints()) return true;
+  motor_torques_.setZero(control.tau.size());
+  if (!set_prescribed_torques(t, motor_torques_)) return false;
+  for (Eigen::Index k = 0; k < row_rate_.size(); ++k) {
+    motors += motor_torques_(prescribed_.motors[k]) * prescribed_.gear(k) * row_rate_(k);
+    friction -= prescribed_.friction(k) * std::abs(row_rate_(k));
+  }
+  return true;
+}
+
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
-  return set_time(t) && motion_jacobian(t, y.head(motion_size), jacobian, evaluations);
+  if (!set_time(t)) return false;
+  if (law_size_) {
+    project_exactly(true);
+    const bool exists = difference_jacobian(t, y.head(motion_size + law_size_), jacobian, evaluations);
+    project_exactly(false);
+    if (!exists) return false;
+  } else if (!motion_jacobian(t, y.head(motion_size), jacobian, evaluations)) {
+    return false;
+  }
+  if (!work_size_) return true;
+  const Eigen::Index coupled = jacobian.rows();
+  jacobian.conservativeResize(coupled + work_size_, coupled + work_size_);
+  jacobian.rightCols(work_size_).setZero(), jacobian.bottomRows(work_size_).setZero();
+  return true;
 }
 
 const Vector& System::applied_force(In v) {
-  if (!core.joints.exerts_force()) return control.u_tree;
+  if (!core.joints.exerts_force() && !forces_) return control.u_tree;
   applied_force_ = control.u_tree;
+  if (forces_) applied_force_ += forces_->value;
   core.joints.add_friction_force(v, applied_force_);
   return applied_force_;
 }
@@ -83,11 +159,15 @@ bool System::acceleration_with_held_joints(In v, In correction, Out a) {
 
 bool System::acceleration_derivatives(In q_tree, In v, In correction) {
   eq_1_is_valid_ = false;
-  if (!control.is_active() && !core.joints.has_smooth_friction()) {  // nothing depends on the state
+  if (!control.is_active() && !forces_ && !core.joints.has_smooth_friction()) {  // nothing depends on the state
     force_.value = control.u_tree;
     force_.by_q.resize(0, 0), force_.by_v.resize(0, 0);
   } else if (!control.derivatives(core, force_.by_q, force_.by_v, force_.value)) {
     return false;
+  }
+  if (forces_) {
+    force_.value += forces_->value;
+    if (!forces_->add_derivative(core, force_.by_q)) return false;
   }
   eq_1_is_valid_ = core.acceleration_derivatives(q_tree, v, correction, force_, eq_1_);
   return eq_1_is_valid_ || fail(RhsFailure::rank_lost);
@@ -138,17 +218,25 @@ double System::phi_z_margin() {
 }
 
 bool System::motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
+  return difference_jacobian(t, y, jacobian, evaluations);
+}
+
+// Derivative of the leading entries of y' with respect to these entries, by forward differences.
+bool System::difference_jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   const auto size = y.size();
+  const auto rates = [&](In at, Out y_dot) {
+    return size > motion_size ? coupled_rhs(t, at, y_dot) : motion_rhs(t, at, y_dot);
+  };
   eq_1_is_valid_ = false;
   jacobian.resize(size, size), moved_rate_.resize(size), rate_at_y_.resize(size);
   moved_y_ = y;
   ++evaluations, ++counts.differences;
-  if (!motion_rhs(t, moved_y_, rate_at_y_)) return false;
+  if (!rates(moved_y_, rate_at_y_)) return false;
   for (Eigen::Index k = 0; k < size; ++k) {
     moved_y_(k) = y(k) + difference_step * std::max(1.0, std::abs(y(k)));
     const double step = moved_y_(k) - y(k);
     ++evaluations;
-    if (!motion_rhs(t, moved_y_, moved_rate_)) return false;
+    if (!rates(moved_y_, moved_rate_)) return false;
     jacobian.col(k) = (moved_rate_ - rate_at_y_) / step;
     moved_y_(k) = y(k);
   }

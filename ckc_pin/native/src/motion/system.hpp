@@ -1,8 +1,9 @@
-// A formulation of the equations of motion as a first-order system y' = f(t, y). An integrand, if there is one, has the
-// last entries of y.
+// A formulation of the equations of motion as a first-order system y' = f(t, y). The entries of y are those of the motion,
+// the state of the control law, the works if they are integrated, and an integrand, if there is one.
 #pragma once
 
 #include "control/control.hpp"
+#include "control/forces.hpp"
 #include "loops/elimination_check.hpp"
 #include "loops/spectrum.hpp"
 #include "motion/integrand.hpp"
@@ -49,13 +50,37 @@ struct PrescribedJoints {
   std::unique_ptr<Trajectory> trajectory;
 };
 
+// Instants at which functions of time (desired and prescribed motions, forces) or their derivatives jump. Steps end at
+// them.
+struct Breakpoints {
+  Vector times;            // increasing
+  double tolerance = 0.0;  // s: times closer than this coincide
+};
+
+// Works since the start, J.
+enum class WorkOf { motors, dampers, friction, forces };
+constexpr int work_count = 4;
+
 class System {
  public:
   System(Core& core, Control& control, int motion_size);
   virtual ~System() = default;
   // Append an integrand to y. It must outlive this system.
   void append(Integrand& integrand);
+  void integrate_works();
+  int coupled_size() const { return motion_size + law_size_ + work_size_; }  // entries of y before an integrand's
+  bool integrates_works() const { return work_size_ > 0; }
+  auto works(In y) const { return y.segment(motion_size + law_size_, work_size_); }
+  // Set the entries of y behind the motion's at the start.
+  void start_appended(Out y);
   void prescribe(PrescribedJoints joints);
+  void set_forces(std::unique_ptr<BodyForces> forces) { forces_ = std::move(forces); }
+  const BodyForces* forces() const { return forces_.get(); }
+  void set_breakpoints(Breakpoints breakpoints) { breakpoints_ = std::move(breakpoints); }
+  double next_breakpoint() const;
+  double breakpoint_tolerance() const { return breakpoints_.tolerance; }
+  // Begin the segment of smooth functions of time that contains t or begins there, up to the tolerance.
+  void start_segment(double t);
   bool has_prescribed_joints() const { return !prescribed_.rows.empty(); }
   double row_time() const { return has_prescribed_joints() ? row_time_ : 0.0; }  // of the prescribed motion that is set
   // Replace the torques of the motors on prescribed joints by those that make them move as prescribed, at the core's
@@ -70,9 +95,9 @@ class System {
   // Compute y'. False if it does not exist or is not finite.
   bool rhs(double t, In y, Out y_dot);
   // Set the core and the members below to the state, projected as the formulation requires. False if that fails.
-  virtual bool sync_core(double t, In y) = 0;
+  bool sync_core(double t, In y) { return read_law_state(y), sync_motion(t, y); }
   // The same without projection, if possible.
-  virtual bool sync_core_unprojected(double t, In y) { return sync_core(t, y); }
+  bool sync_core_unprojected(double t, In y) { return read_law_state(y), sync_motion_unprojected(t, y); }
   // Read a coordinate (or its rate) from y, unprojected. False if y does not contain it.
   virtual bool read_from_state(In /*y*/, int /*k*/, bool /*of_rate*/, double& /*value*/) const { return false; }
   // Write the projected state of the core, which belongs to y, into y.
@@ -90,8 +115,8 @@ class System {
   virtual Accepted accept_step(double t, Out y, double margin) = 0;
   // Return to the user's partition. False if its phi_z is singular.
   virtual bool restore_partition(double, Out, bool& changed) { return changed = false, true; }
-  // Derivative of the motion's entries of y' with respect to those of y. Finite differences are counted in
-  // `evaluations`. False if it does not exist.
+  // Derivative of the coupled entries of y' with respect to those of y; that of the works is not computed and set to
+  // zero, because nothing depends on them. Finite differences are counted in `evaluations`. False if it does not exist.
   bool jacobian(double t, In y, Matrix& jacobian, long& evaluations);
   // Pairs (i, j) of entries of y where the rate of y(i) is y(j).
   virtual void rate_pairs(std::vector<std::pair<int, int>>& of) const = 0;
@@ -161,11 +186,21 @@ class System {
 
   RhsFailure failure = RhsFailure::none;  // of the last right-hand side
 
-  // Evaluate the control at the core's state. False if the controller has no u.
-  bool compute_control(double t) { return control.compute(measured(t)) || fail(RhsFailure::no_control); }
+  // Evaluate control and forces at the core's state. False if one of them does not exist.
+  bool compute_control(double t) {
+    return (control.compute(measured(t)) && (!forces_ || forces_->compute(measured(t), control.failure))) ||
+           fail(RhsFailure::no_control);
+  }
   MeasuredState measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
 
  protected:
+  virtual bool sync_motion(double t, In y) = 0;
+  virtual bool sync_motion_unprojected(double t, In y) { return sync_motion(t, y); }
+  // Whether control or forces need the core at the state.
+  bool force_needs_core() const { return control.needs_terms() || forces_ || law_size_; }
+  bool has_applied_force() const { return control.is_active() || forces_ || core.joints.exerts_force(); }
+  // Called before and after finite differences.
+  virtual void project_exactly(bool) {}
   // `rhs` and `jacobian` of the motion. All arguments have the motion's entries only. The default Jacobian uses finite
   // differences.
   virtual bool motion_rhs(double t, In y, Out y_dot) = 0;
@@ -181,7 +216,19 @@ class System {
   AccelerationDerivatives eq_1_;
 
  private:
+  void read_law_state(In y) {
+    if (law_size_) control.law->state = y.segment(motion_size, law_size_);
+  }
+  bool coupled_rhs(double t, In y, Out y_dot);
+  bool powers(double t, In y, Out power);
+  bool difference_jacobian(double t, In y, Matrix& jacobian, long& evaluations);
+
   bool eq_1_is_valid_ = false;
+  int law_size_ = 0, work_size_ = 0;
+  std::unique_ptr<BodyForces> forces_;
+  Breakpoints breakpoints_;
+  Eigen::Index passed_breakpoints_ = 0;
+  Vector motor_torques_;
   std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
   PrescribedJoints prescribed_;
   Vector row_value_, row_rate_, row_acceleration_, lambda_;

@@ -27,7 +27,7 @@ void SensitivityIntegrand::start(In q_tree, In v_tree, Out y) {
 }
 
 bool SensitivityIntegrand::rates(In y, Out y_dot) {
-  Eigen::Map<Matrix> s_dot(y_dot.data() + system_.motion_size, rows_, sensitivities.count);
+  Eigen::Map<Matrix> s_dot(y_dot.data() + system_.coupled_size(), rows_, sensitivities.count);
   if (sensitivities.has_compiled_terms() &&
       sensitivities.compiled_rates(system_.configuration_at_last_rhs(), system_.v_tree, columns(y), s_dot) &&
       finite(s_dot.reshaped()))
@@ -111,7 +111,6 @@ bool SensitivityIntegrand::stays_locked(double atol) {
 
 bool SensitivityIntegrand::control_sampled(In y, bool& changed) {
   const Sampling& sampling = *system_.control.sampling;
-  if (!sampling.holds_output) return true;
   load(y);
   if (sensitivities.control_sampled(s_, sampling, changed)) return true;
   return system_.failure = RhsFailure::not_finite, false;

@@ -34,9 +34,9 @@ class SensitivityIntegrand final : public Integrand {
   void fill_record(In y, Out row) override;
 
  private:
-  Eigen::Map<const Matrix> columns(In y) const { return {y.data() + system_.motion_size, rows_, sensitivities.count}; }
+  Eigen::Map<const Matrix> columns(In y) const { return {y.data() + system_.coupled_size(), rows_, sensitivities.count}; }
   void load(In y) { s_ = columns(y); }
-  void store(Out y) const { y.segment(system_.motion_size, size()) = s_.reshaped(); }
+  void store(Out y) const { y.segment(system_.coupled_size(), size()) = s_.reshaped(); }
   bool general_rates(In y, In y_dot);  // by Pinocchio's terms
 
   System& system_;
