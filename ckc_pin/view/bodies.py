@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,12 @@ from ckc_pin.view.commands import Command
 from ckc_pin.view.geometry import (
     COINCIDENCE_TOLERANCE,
     Placements,
-    Segment,
     find_position_loops,
-    find_segments,
     homogeneous,
 )
-from ckc_pin.view.visuals import Colour, Visual, load_surface, read_visuals
+from ckc_pin.view.hulls import compute_flat_hull, compute_solid_hull
+from ckc_pin.view.links import SLIDER_LENGTH, Bar, Plate, compute_rank, find_ground, find_link_shapes
+from ckc_pin.view.visuals import Colour, Surface, Visual, load_surface, read_visuals
 
 __all__ = ["GHOST", "SOLID", "TRANSLUCENT", "Appearance", "body_path", "draw_bodies", "draw_gaps", "draw_loop_frames",
            "escape_path", "find_missing_meshes", "gap_path"]  # fmt: skip
@@ -30,6 +30,8 @@ __all__ = ["GHOST", "SOLID", "TRANSLUCENT", "Appearance", "body_path", "draw_bod
 BASE_COLOUR: Colour = (0.45, 0.47, 0.50)
 FRAME_A_COLOUR: Colour = (0.10, 0.10, 0.10)
 FRAME_B_COLOUR: Colour = (0.94, 0.89, 0.26)
+GROUND_COLOUR: Colour = (0.66, 0.68, 0.71)  # of a base without visuals
+RAIL_COLOUR: Colour = (0.25, 0.25, 0.28)  # of the base's rails
 GAP_COLOUR: Colour = (0.80, 0.15, 0.25)
 LINK_COLOURS: tuple[Colour, ...] = (  # the palette of Okabe and Ito
     (0.00, 0.45, 0.70), (0.84, 0.37, 0.00), (0.00, 0.62, 0.45), (0.80, 0.47, 0.65), (0.90, 0.62, 0.00),
@@ -37,8 +39,10 @@ LINK_COLOURS: tuple[Colour, ...] = (  # the palette of Okabe and Ito
 )  # fmt: skip
 # Lengths relative to the mechanism's size.
 ROD_RADIUS = 0.03
+SLIDER_WIDTH = 0.06
 GAP_ROD_RADIUS = 0.008
 FRAME_A_RADIUS, FRAME_B_RADIUS = 0.018, 0.03
+THICKNESSES = 7  # of plates
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,12 @@ def body_path(mechanism: Mechanism, root: str, joint: int) -> str:
 def draw_bodies(
     mechanism: Mechanism, root: str, poses: Placements, appearance: Appearance, meshes: Path | None = None
 ) -> Iterator[Command]:
-    """Draw the links by their URDF's visuals, and links without visuals as rods. A ghost has no base.
+    """Draw the links by their URDF's visuals, and links without visuals as rods and plates. A ghost has no base.
 
     Parameters
     ----------
     poses : Placements
-        All poses that will be shown: they give the lengths of rails.
+        All poses that will be shown: they give the lengths of rails, cylinders and their rods.
     meshes : Path, optional
         Folder of the mesh files, if it is not the mechanism's own.
     """
@@ -98,7 +102,7 @@ def draw_bodies(
         if command is not None:
             drawn_joints.add(visual.joint)
             yield command
-    yield from _draw_rods(mechanism, root, poses, drawn_joints, palette, appearance)
+    yield from _draw_links(mechanism, root, poses, drawn_joints, palette, appearance)
 
 
 def find_missing_meshes(mechanism: Mechanism, meshes: Path | None = None) -> list[str]:
@@ -118,27 +122,64 @@ def _draw_visual(visual: Visual, path: str, material: dict[str, Any], folder: Pa
     return commands.draw_surface(path, corners, faces, visual.placement, material)
 
 
-def _draw_rods(
+def _draw_links(
     mechanism: Mechanism, root: str, poses: Placements, drawn: set[int], palette: list[Colour], appearance: Appearance
 ) -> Iterator[Command]:
-    """Draw bodies without visuals as rods with a ball at their joint, and the rails of slides as thinner rods."""
+    """Draw bodies without visuals: their links, and a ball at each hinge."""
     radius = ROD_RADIUS * mechanism.size
+    shapes = find_link_shapes(mechanism, poses)
+
+    def material(joint: int, base_colour: Colour = GROUND_COLOUR) -> dict[str, Any]:
+        return appearance.create_material(palette[joint] if joint else base_colour)
+
+    def draw_bars(name: str, bars: Sequence[Bar], ratio: float) -> Iterator[Command]:
+        base_colour = RAIL_COLOUR if name == "rail" else GROUND_COLOUR
+        for k, bar in enumerate(bars):
+            if bar.joint not in drawn and not (appearance is GHOST and not bar.joint):
+                path = f"{body_path(mechanism, root, bar.joint)}/{name}:{k}"
+                placement, size = _place_cylinder(bar.start, bar.end), [ratio * radius, bar.length]
+                yield commands.draw_primitive(path, "cylinder", size, placement, material(bar.joint, base_colour))
+
+    def draw_plates(plates: Sequence[Plate]) -> Iterator[Command]:
+        for k, plate in enumerate(plates):
+            if plate.joint not in drawn:
+                path = f"{body_path(mechanism, root, plate.joint)}/plate:{k}"
+                corners, faces = _compute_plate(plate, mechanism.size)
+                yield commands.draw_surface(path, corners, faces, np.eye(4), material(plate.joint))
+
+    telescopic = {bar.joint for bar in shapes.rods}
+    sliding = {slider.joint for slider in shapes.sliders}
     for joint in range(1, mechanism.tree.model.njoints):
-        if joint not in drawn and not _is_hidden_ball(mechanism, joint, drawn):
+        if joint not in drawn | telescopic | sliding and not _is_hidden_ball(mechanism, joint, drawn):
             path = f"{body_path(mechanism, root, joint)}/ball"
-            material = appearance.create_material(palette[joint])
-            yield commands.draw_primitive(path, "sphere", [1.4 * radius], np.eye(4), material)
-    for k, segment in enumerate(find_segments(mechanism)):
-        if segment.joint in drawn or (appearance is GHOST and not segment.joint):
-            continue
-        is_rail = segment.joint != segment.end_joint
-        start, end = _find_rail_ends(segment, poses) if is_rail else (segment.start, segment.end)
-        length = float(np.linalg.norm(end - start))
-        if length > COINCIDENCE_TOLERANCE * mechanism.size:
-            path = f"{body_path(mechanism, root, segment.joint)}/{'rail' if is_rail else 'rod'}:{k}"
-            size = [0.5 * radius if is_rail else radius, length]
-            material = appearance.create_material(palette[segment.joint])
-            yield commands.draw_primitive(path, "cylinder", size, _place_cylinder(start, end), material)
+            yield commands.draw_primitive(path, "sphere", [1.4 * radius], np.eye(4), material(joint))
+    yield from draw_bars("rod", shapes.bars, 1.0)
+    yield from draw_plates(shapes.plates)
+    yield from draw_bars("cylinder", shapes.cylinders, 1.3)
+    yield from draw_bars("piston", shapes.rods, 0.6)
+    yield from draw_bars("rail", shapes.rails, 0.5)
+    for slider in shapes.sliders:
+        if slider.joint not in drawn:
+            path = f"{body_path(mechanism, root, slider.joint)}/slider"
+            size = mechanism.size * np.array([SLIDER_WIDTH, SLIDER_WIDTH, 2 * SLIDER_LENGTH])
+            end = slider.centre + slider.direction
+            placement = _place_cylinder(slider.centre - slider.direction, end)
+            yield commands.draw_primitive(path, "box", size, placement, material(slider.joint))
+    if 0 not in drawn and appearance is not GHOST:
+        ground, posts = find_ground(mechanism, shapes, poses, radius)
+        yield from draw_bars("rod", [shape for shape in ground if isinstance(shape, Bar)], 1.0)
+        yield from draw_plates([shape for shape in ground if isinstance(shape, Plate)])
+        yield from draw_bars("post", posts, 0.6)
+
+
+def _compute_plate(plate: Plate, size: float) -> Surface:
+    rank, normal = compute_rank(plate.corners, size)
+    radius = ROD_RADIUS * size
+    if rank > 2:
+        return compute_solid_hull(plate.corners, 0.5 * radius)
+    # Faces of different plates in one plane would flicker, so each body has a thickness of its own.
+    thickness = radius * (1.0 + 0.05 * (plate.joint % THICKNESSES))
+    return compute_flat_hull(plate.corners, normal, radius, thickness)
 
 
 def _is_hidden_ball(mechanism: Mechanism, joint: int, drawn: set[int]) -> bool:
@@ -155,15 +196,6 @@ def _is_hidden_ball(mechanism: Mechanism, joint: int, drawn: set[int]) -> bool:
 
 def _is_hinge(mechanism: Mechanism, joint: int) -> bool:
     return bool(mechanism.tree.model.joints[joint].shortname().startswith("JointModelR"))
-
-
-def _find_rail_ends(segment: Segment, poses: Placements) -> tuple[Array, Array]:
-    """Return the ends of the line on which a slide moves, in the axes of the parent body."""
-    offsets = poses.point_positions(segment.end_joint, segment.end) - poses.translation[:, segment.joint]
-    points = np.vstack([segment.start, np.einsum("kji,kj->ki", poses.rotation[:, segment.joint], offsets)])
-    farthest = points[np.argmax(np.linalg.norm(points - segment.start, axis=1))]
-    positions = points @ (farthest - segment.start)
-    return points[np.argmin(positions)], points[np.argmax(positions)]
 
 
 def _place_cylinder(start: Array, end: Array) -> Array:

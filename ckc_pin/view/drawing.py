@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from ckc_pin.view.geometry import (
     compute_loop_gaps,
     compute_placements,
     compute_view_axes,
-    find_segments,
+    find_body_points,
     homogeneous,
     is_planar,
     pinocchio_configurations,
@@ -229,12 +230,12 @@ def set_camera(mechanism: Mechanism, extent: tuple[Array, Array]) -> list[Comman
 
 
 def motion_extent(mechanism: Mechanism, motions: Sequence[Placements]) -> tuple[Array, Array]:
-    """Return the bounds of all segments during motions, in the viewer's axes, m."""
+    """Return the bounds of all points of bodies during motions, in the viewer's axes, m."""
     points = [
         poses.point_positions(joint, point)
         for poses in motions
-        for segment in find_segments(mechanism)
-        for joint, point in ((segment.joint, segment.start), (segment.end_joint, segment.end))
+        for joint, body_points in enumerate(find_body_points(mechanism))
+        for point in body_points
     ]
     projected = np.concatenate(points) @ _compute_camera_axes(mechanism)[0].T if points else np.zeros((1, 3))
     return projected.min(axis=0), projected.max(axis=0)
@@ -243,7 +244,7 @@ def motion_extent(mechanism: Mechanism, motions: Sequence[Placements]) -> tuple[
 def estimate_reach(mechanism: Mechanism, pose: Placements) -> tuple[Array, Array]:
     """Estimate the bounds of a future motion: the current pose, enlarged by the longest link on all sides, m."""
     low, high = motion_extent(mechanism, [pose])
-    lengths = (np.linalg.norm(s.end - s.start) for s in find_segments(mechanism) if s.joint == s.end_joint)
+    lengths = (np.linalg.norm(a - b) for points in find_body_points(mechanism) for a, b in combinations(points, 2))
     longest = max(map(float, lengths), default=mechanism.size)
     margin = longest * np.array([1.0, 1.0, 0.0 if is_planar(mechanism) else 1.0])
     return low - margin, high + margin

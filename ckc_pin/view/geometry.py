@@ -1,9 +1,8 @@
-"""Geometry of a mechanism for drawing: segments, body placements along a run, projections, outlines and loop gaps."""
+"""Geometry of a mechanism for drawing: points of bodies, their placements along a run, projections and loop gaps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -13,26 +12,12 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rows import Component, Distance
 from ckc_pin.run.run import Run
 
-__all__ = ["Outline", "Placements", "Projection", "Segment", "Slide", "compute_loop_gaps", "compute_placements",
-           "compute_view_axes", "find_position_loops", "find_segments", "find_slides", "homogeneous", "is_planar",
-           "pinocchio_configurations", "project_base", "project_outline", "projection_planes",
-           "up_direction"]  # fmt: skip
+__all__ = ["COINCIDENCE_TOLERANCE", "Placements", "Projection", "Slide", "compute_loop_gaps", "compute_placements",
+           "compute_view_axes", "find_body_points", "find_plane_normal", "find_position_loops", "find_slides",
+           "homogeneous", "is_planar", "pinocchio_configurations", "projection_planes", "up_direction"]  # fmt: skip
 
 PARALLEL_TOLERANCE = 1e-9  # sine of the angle below which two joint axes are parallel
-END_ON_SINE = 0.3  # a slider is drawn end-on if the sine of its angle to the line of sight is smaller
 COINCIDENCE_TOLERANCE = 1e-9  # of the mechanism's size: points closer than this are one point
-SLIDER_LENGTH = 0.045  # half the length of a slider's block, of the mechanism's size
-SLIDER_WIDTH = 0.022
-
-
-@dataclass(frozen=True)
-class Segment:
-    """A line segment from a point of one body to a point of another, usually the same; joints number the bodies."""
-
-    joint: int
-    start: Array
-    end_joint: int
-    end: Array
 
 
 @dataclass(frozen=True)
@@ -89,26 +74,38 @@ def homogeneous(rotation: Array, translation: Array) -> Array:
     return matrix
 
 
-# --- segments ------------------------------------------------------------------------------------
+# --- points and slides ---------------------------------------------------------------------------
 
 
-def find_segments(mechanism: Mechanism) -> list[Segment]:
-    """Return the links as line segments between joint origins, loop frames and named points.
+def find_body_points(mechanism: Mechanism) -> list[list[Array]]:
+    """Return, by body, the distinct points that its link connects, in the body's axes.
 
-    The segments of a body start at its joint and end at every other point on it. Those of the base join consecutive
-    points. A body without points gets a segment to its centre of mass. A slide adds the segment from the origin of
-    its rail to its body.
+    They are the origins of the joints on the body, loop frames, named points, and the origin of the body's own joint.
+    A moving body without any other point has its centre of mass as well. A slide on the base has no fixed point there.
     """
     model = mechanism.tree.model
-    segments: list[Segment] = []
-    for joint, points in enumerate(_find_body_points(mechanism)):
-        if joint == 0:
-            segments += [Segment(0, a, 0, b) for a, b in pairwise(points)]
-            continue
-        ends = points or [model.inertias[joint].lever.copy()]
-        segments += [Segment(joint, np.zeros(3), joint, end) for end in ends if np.any(end)]
-    rails = [Segment(slide.parent, slide.origin, slide.joint, np.zeros(3)) for slide in find_slides(mechanism)]
-    return segments + rails
+    tolerance = COINCIDENCE_TOLERANCE * mechanism.size
+    points: list[list[Array]] = [[] for _ in range(model.njoints)]
+
+    def add(joint: int, point: Array) -> None:
+        if not any(np.allclose(point, other, rtol=0.0, atol=tolerance) for other in points[joint]):
+            points[joint].append(point)
+
+    base_slides = [slide.joint for slide in find_slides(mechanism) if not slide.parent]
+    for joint in range(1, model.njoints):
+        if model.joints[joint].nv == 1 and joint not in base_slides:  # A free root is not attached to its parent.
+            add(model.parents[joint], model.jointPlacements[joint].translation.copy())
+    for loop in mechanism.spec.loop:
+        for frame in (loop.frame_a, loop.frame_b):
+            anchor = mechanism.frames.find(frame, loop.name)
+            add(anchor.joint, anchor.translation)
+    for anchor in mechanism.points.values():
+        add(anchor.joint, anchor.translation)
+    for joint in range(1, model.njoints):
+        if not points[joint]:
+            add(joint, model.inertias[joint].lever.copy())
+        add(joint, np.zeros(3))
+    return points
 
 
 def find_slides(mechanism: Mechanism) -> list[Slide]:
@@ -123,34 +120,12 @@ def find_slides(mechanism: Mechanism) -> list[Slide]:
     return slides
 
 
-def _find_body_points(mechanism: Mechanism) -> list[list[Array]]:
-    """Return, by body, the distinct points that its segments join, in the body's axes."""
-    model = mechanism.tree.model
-    tolerance = COINCIDENCE_TOLERANCE * mechanism.size
-    points: list[list[Array]] = [[] for _ in range(model.njoints)]
-
-    def add(joint: int, point: Array) -> None:
-        if not any(np.allclose(point, other, rtol=0.0, atol=tolerance) for other in points[joint]):
-            points[joint].append(point)
-
-    for joint in range(1, model.njoints):
-        if model.joints[joint].nv == 1:  # A free root is not attached to its parent.
-            add(model.parents[joint], model.jointPlacements[joint].translation.copy())
-    for loop in mechanism.spec.loop:
-        for frame in (loop.frame_a, loop.frame_b):
-            anchor = mechanism.frames.find(frame, loop.name)
-            add(anchor.joint, anchor.translation)
-    for anchor in mechanism.points.values():
-        add(anchor.joint, anchor.translation)
-    return points
-
-
 # --- views ---------------------------------------------------------------------------------------
 
 
 def is_planar(mechanism: Mechanism) -> bool:
     """Return whether all bodies move in parallel planes."""
-    return _find_plane_normal(mechanism) is not None
+    return find_plane_normal(mechanism) is not None
 
 
 def up_direction(mechanism: Mechanism) -> Array:
@@ -166,7 +141,7 @@ def compute_view_axes(mechanism: Mechanism) -> Array:
     other mechanism is seen obliquely from above, with gravity pointing down.
     """
     up = up_direction(mechanism)
-    normal = _find_plane_normal(mechanism)
+    normal = find_plane_normal(mechanism)
     if normal is None:
         horizontal = np.eye(3)[int(np.argmin(np.abs(up)))]
         horizontal -= (horizontal @ up) * up
@@ -207,7 +182,7 @@ def _name_axis(direction: Array, default: str) -> str:
     return default
 
 
-def _find_plane_normal(mechanism: Mechanism) -> Array | None:
+def find_plane_normal(mechanism: Mechanism) -> Array | None:
     """Return the normal of a planar mechanism: all hinges are parallel to it, all slides perpendicular to it."""
     tree = mechanism.tree
     if tree.free_roots:
@@ -221,78 +196,6 @@ def _find_plane_normal(mechanism: Mechanism) -> Array | None:
     is_oblique = any(np.linalg.norm(np.cross(axis, normal)) > PARALLEL_TOLERANCE for axis in hinges)
     leaves_plane = any(abs(slide @ normal) > PARALLEL_TOLERANCE * np.linalg.norm(slide) for slide in slides)
     return None if is_oblique or leaves_plane else normal
-
-
-# --- outlines ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Outline:
-    """The moving parts of a mechanism in one pose, projected on a plane.
-
-    Attributes
-    ----------
-    bars : list of (2, 2) arrays
-        Ends of the links by axis of the plane, m.
-    rings : (m, 2) array
-        Hinges, m.
-    blocks : list of (4, 2) arrays
-        Corners of sliders and sleeves, m.
-    """
-
-    bars: list[Array]
-    rings: Array
-    blocks: list[Array]
-
-
-def project_outline(mechanism: Mechanism, pose: Placements, plane: Projection) -> Outline:
-    """Project the moving parts of a mechanism on a plane; `pose` holds one configuration."""
-    slides = {slide.joint: slide for slide in find_slides(mechanism)}
-    bars: list[Array] = []
-    rings: list[Array] = []
-    for segment in find_segments(mechanism):
-        if segment.joint == segment.end_joint == 0:
-            rings += [segment.start, segment.end]
-            continue
-        is_rail = segment.joint != segment.end_joint
-        if is_rail and not segment.joint:
-            continue  # Rails on the base do not move; `project_base` returns them.
-        ends = np.vstack([pose.point_positions(segment.joint, segment.start),
-                          pose.point_positions(segment.end_joint, segment.end)])  # fmt: skip
-        bars.append(ends @ plane.axes.T)
-        if not is_rail:
-            rings += [end for end, local in zip(ends, (segment.start, segment.end), strict=True)
-                      if segment.joint not in slides or np.any(local)]  # fmt: skip
-    blocks = []
-    for slide in slides.values():  # On the base's rail it is a slider, on a moving body a sleeve around the rod.
-        centre = (
-            pose.point_positions(slide.parent, slide.origin)[0] if slide.parent else pose.translation[0, slide.joint]
-        )
-        blocks.append(_project_block(plane, centre, pose.rotation[0, slide.parent] @ slide.direction, mechanism.size))
-        rings = [ring for ring in rings if np.linalg.norm(ring - centre) > COINCIDENCE_TOLERANCE * mechanism.size]
-    return Outline(bars, np.array(rings).reshape(-1, 3) @ plane.axes.T, blocks)
-
-
-def _project_block(plane: Projection, centre: Array, direction: Array, size: float) -> Array:
-    middle, projected = plane.axes @ centre, plane.axes @ direction
-    is_end_on = np.linalg.norm(projected) <= END_ON_SINE
-    long = SLIDER_LENGTH * size * (np.array([0.5, 0.0]) if is_end_on else projected)
-    wide = SLIDER_WIDTH * size * np.array([-long[1], long[0]]) / np.linalg.norm(long)
-    return np.array([middle + a * long + b * wide for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
-
-
-def project_base(mechanism: Mechanism, poses: Placements, plane: Projection) -> tuple[list[Array], list[Array]]:
-    """Project the fixed parts on a plane: the base's bars, and its rails as far as sliders move in these poses."""
-    bars = [np.array([segment.start, segment.end]) @ plane.axes.T
-            for segment in find_segments(mechanism) if segment.joint == segment.end_joint == 0]  # fmt: skip
-    rails = []
-    for slide in find_slides(mechanism):
-        if not slide.parent:
-            travel = (poses.translation[:, slide.joint] - slide.origin) @ slide.direction
-            margin = 0.08 * mechanism.size
-            ends = np.outer([travel.min() - margin, travel.max() + margin], slide.direction) + slide.origin
-            rails.append(ends @ plane.axes.T)
-    return bars, rails
 
 
 # --- loop gaps -----------------------------------------------------------------------------------

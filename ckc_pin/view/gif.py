@@ -11,20 +11,21 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
 from ckc_pin.view.geometry import (
-    Outline,
+    Placements,
     Projection,
     compute_placements,
     compute_view_axes,
     is_planar,
     pinocchio_configurations,
-    project_base,
-    project_outline,
     projection_planes,
 )
 from ckc_pin.view.layout import add_header, fit_legend, legend_line
+from ckc_pin.view.links import find_link_shapes
+from ckc_pin.view.outlines import Outline, draw_base, project_base, project_outline
 from ckc_pin.view.player import require_parent_folder, require_playable_runs
 from ckc_pin.view.run_group import compute_desired_poses
 from ckc_pin.view.style import escape_mathtext, figure_style, label_runs
@@ -36,6 +37,7 @@ MAX_FRAMES = 1200
 LAST_FRAME_MS = 1000
 WIDTH_IN, MIN_HEIGHT_IN, MAX_HEIGHT_IN = 4.8, 2.2, 6.0
 DPI = 100
+PLATE_ALPHA = 0.2
 PALETTE_SIZE = 64
 PALETTE_FRAMES = 5  # frames that the palette is computed from
 
@@ -100,17 +102,21 @@ class _MovingOutline:
 
         self.outlines = outlines
         first = outlines[0]
+        plate_properties = {"facecolor": (colour, PLATE_ALPHA), "edgecolor": colour, "joinstyle": "round"} | properties
+        self.plates = [ax.add_patch(Polygon(plate, **plate_properties)) for plate in first.plates]
         self.bars = ax.add_collection(LineCollection(first.bars, colors=[colour], **properties))
         alpha = properties.get("alpha")
         ring_properties = {"color": colour, "markerfacecolor": "white", "markersize": 4.5, "alpha": alpha}
         (self.rings,) = ax.plot(*first.rings.T, linestyle="none", marker="o", **ring_properties)
         block_properties = {"facecolor": "white", "edgecolor": colour, "alpha": alpha}
         self.blocks = [ax.add_patch(Polygon(block, **block_properties)) for block in first.blocks]
-        self.artists = [self.bars, *self.blocks, self.rings]  # in drawing order
+        self.artists = [*self.plates, self.bars, *self.blocks, self.rings]  # in drawing order
 
     def move_to(self, k: int, is_visible: bool = True) -> None:
         """Move the artists to frame k."""
         outline = self.outlines[k]
+        for patch, plate in zip(self.plates, outline.plates, strict=True):
+            patch.set_xy(plate)
         self.bars.set_segments(outline.bars)
         self.rings.set_data(*outline.rings.T)
         for patch, block in zip(self.blocks, outline.blocks, strict=True):
@@ -130,19 +136,13 @@ class _Animation:
         rows = [np.array([run.at(t) for t in times]) for run in runs]
         motions = [compute_placements(run.mechanism, pinocchio_configurations(run, selected))
                    for run, selected in zip(runs, rows, strict=True)]  # fmt: skip
-        outlines = [
-            [project_outline(run.mechanism, motion.select_row(k), self.plane) for k in range(len(times))]
-            for run, motion in zip(runs, motions, strict=True)
-        ]
-        bars, rails = project_base(mechanism, motions[0], self.plane)
+        outlines = [self._project(run.mechanism, motion) for run, motion in zip(runs, motions, strict=True)]
+        base = project_base(find_link_shapes(mechanism, motions[0]), self.plane)
         paths = [self.plane.axes @ path.T for run in runs for path in run.points.values()]
         moving_points = [x for frames in outlines for frame in frames
-                         for x in (*frame.bars, frame.rings, *frame.blocks)]  # fmt: skip
-        self._create_figure(np.vstack([*bars, *rails, *(path.T for path in paths), *moving_points]), speed)
-        for bar in bars:
-            self.ax.plot(*bar.T, color=style.GREY, linewidth=3.0, alpha=0.5 if rails else 1.0)
-        for rail in rails:
-            self.ax.plot(*rail.T, color="black", linewidth=1.0, marker="|", markersize=5)
+                         for x in (*frame.bars, *frame.plates, frame.rings, *frame.blocks)]  # fmt: skip
+        self._create_figure(np.vstack([base.ground, *base.rails, *(path.T for path in paths), *moving_points]), speed)
+        draw_base(self.ax, base)
         for path in paths:
             self.ax.plot(*path, color=style.GREY, linewidth=0.8, linestyle=":")
         self.desired, self.is_reachable = self._create_desired(rows[0])
@@ -181,8 +181,15 @@ class _Animation:
             return None, None
         mechanism = self.runs[0].mechanism
         poses = compute_placements(mechanism, desired.q_tree)
-        outlines = [project_outline(mechanism, poses.select_row(k), self.plane) for k in range(len(rows))]
-        return _MovingOutline(self.ax, outlines, style.REST_COLOUR, linewidth=2.4), desired.is_reachable
+        return _MovingOutline(
+            self.ax, self._project(mechanism, poses), style.REST_COLOUR, linewidth=2.4
+        ), desired.is_reachable
+
+    def _project(self, mechanism: Mechanism, poses: Placements) -> list[Outline]:
+        """Project a mechanism in all poses, one for each frame."""
+        shapes = find_link_shapes(mechanism, poses)
+        frames = range(len(self.times))
+        return [project_outline(mechanism, shapes, poses.select_row(k), self.plane) for k in frames]
 
     def render(self) -> list[Any]:
         """Draw all frames in one palette; parts that do not move are drawn once."""

@@ -12,13 +12,14 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import motor_units
 from ckc_pin.run.desired_path import DesiredPath
 from ckc_pin.run.run import Run
 from ckc_pin.view import style
-from ckc_pin.view.geometry import Placements, Projection, compute_placements, project_base, project_outline
+from ckc_pin.view.geometry import Projection, compute_placements
 from ckc_pin.view.layout import PanelSlot, add_note, clip_end_peaks, fit_legend, legend_line, set_panel_title
+from ckc_pin.view.links import find_link_shapes
+from ckc_pin.view.outlines import Outline, draw_base, project_base, project_outline
 from ckc_pin.view.run_group import RunGroup, coordinate_columns
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, rate_symbol
 
@@ -33,6 +34,7 @@ MAX_WRAPPED_TURNS = 20  # a hinge that turns more often is drawn in turns, becau
 MAX_NOTE_NAMES = 3
 SNAPSHOTS = 5
 COLORMAP_END = 0.85  # of viridis; the colours beyond are too pale for print
+PLATE_ALPHA = 0.12
 RING_SIZE_PT = 3.4
 THIN_LINE = 0.7  # of curves without a legend entry
 INITIAL_COLOUR, TARGET_COLOUR, PATH_COLOUR = style.COLOURS[:3]
@@ -228,9 +230,10 @@ def draw_initial_and_desired(slot: PanelSlot, group: RunGroup, plane: Projection
     for path in run.points.values():
         ax.plot(*(plane.axes @ path.T), color=style.GREY, linewidth=0.8, linestyle=":")
     placements = compute_placements(mechanism, np.array([q_tree for q_tree, _ in poses]))
-    _draw_base(ax, mechanism, placements, plane)
+    shapes = find_link_shapes(mechanism, placements)
+    draw_base(ax, project_base(shapes, plane))
     for k, (_, colour) in enumerate(poses):
-        _draw_pose(ax, mechanism, placements.select_row(k), plane, colour, 1.8)
+        _draw_pose(ax, project_outline(mechanism, shapes, placements.select_row(k), plane), colour, 1.8)
     _label_plane(ax, plane)
 
 
@@ -250,32 +253,25 @@ def draw_snapshots(slots: Sequence[PanelSlot], group: RunGroup, planes: Sequence
     rows = [run.at(float(t)) for t in np.linspace(0.0, t_end, SNAPSHOTS)]
     configurations = np.array([mechanism.tree.from_coordinates(run.q_tree[row]) for row in rows])
     placements = compute_placements(mechanism, configurations)
+    shapes = find_link_shapes(mechanism, placements)
     for slot, plane in zip(slots, planes, strict=True):
         (ax,) = slot.add_axes()
         for path in run.points.values():
             ax.plot(*(plane.axes @ path[run.t <= t_end].T), color=style.GREY, linewidth=0.8, linestyle=":")
-        _draw_base(ax, mechanism, placements, plane)
+        draw_base(ax, project_base(shapes, plane))
         for k, row in enumerate(rows):
             linewidth = 1.8 if k in (0, len(rows) - 1) else 0.9
-            _draw_pose(ax, mechanism, placements.select_row(k), plane, mappable.to_rgba(run.t[row]), linewidth)
+            outline = project_outline(mechanism, shapes, placements.select_row(k), plane)
+            _draw_pose(ax, outline, mappable.to_rgba(run.t[row]), linewidth)
         _label_plane(ax, plane)
     return mappable
 
 
-def _draw_base(ax: Any, mechanism: Mechanism, poses: Placements, plane: Projection) -> None:
-    bars, rails = project_base(mechanism, poses, plane)
-    for bar in bars:
-        ax.plot(*bar.T, color=style.GREY, linewidth=3.0, zorder=1, alpha=0.5 if rails else 1.0)
-    for rail in rails:
-        ax.plot(*rail.T, color="black", linewidth=1.0, zorder=2, marker="|", markersize=5)
-
-
-def _draw_pose(
-    ax: Any, mechanism: Mechanism, pose: Placements, plane: Projection, colour: Any, linewidth: float
-) -> None:
+def _draw_pose(ax: Any, outline: Outline, colour: Any, linewidth: float) -> None:
     from matplotlib.patches import Polygon
 
-    outline = project_outline(mechanism, pose, plane)
+    for plate in outline.plates:
+        ax.add_patch(Polygon(plate, facecolor=(colour, PLATE_ALPHA), edgecolor=colour, linewidth=linewidth, zorder=3))
     for bar in outline.bars:
         ax.plot(*bar.T, color=colour, linewidth=linewidth, zorder=3)
     for block in outline.blocks:

@@ -106,7 +106,7 @@ def test_spatial_mechanisms_are_drawn_on_coordinate_planes(stewart):
     assert [(ax.get_xlabel(), ax.get_ylabel()) for ax in (front, side, top)] == [
         ("$x$ (m)", "$z$ (m)"), ("$y$ (m)", "$z$ (m)"), ("$x$ (m)", "$y$ (m)"),
     ]  # fmt: skip
-    assert len(front.patches) == 6 * 5  # a sleeve on each leg, in each pose
+    assert len(front.patches) == 5 * (6 + 1)  # in each pose a cylinder on each leg, and the platform
 
 
 def test_slider_is_drawn_on_its_rail():

@@ -10,14 +10,10 @@ from PIL import Image, ImageSequence
 
 import ckc_pin
 from ckc_pin import InputError, Run, load, simulate
-from ckc_pin.view.geometry import (
-    compute_placements,
-    pinocchio_configurations,
-    project_base,
-    project_outline,
-    projection_planes,
-)
+from ckc_pin.view.geometry import compute_placements, pinocchio_configurations, projection_planes
 from ckc_pin.view.gif import save_gif
+from ckc_pin.view.links import find_link_shapes
+from ckc_pin.view.outlines import project_base, project_outline
 from tests.contract.helpers.command import ckc
 
 L1, L2, BASE = 0.2794, 0.3048, 0.3048  # m, of five_bar
@@ -51,20 +47,21 @@ def test_bars_agree_with_closed_form_positions(swing: Run) -> None:
     plane = projection_planes(swing.mechanism)[0]
     rows = np.array([0, 20, 50])
     moved = compute_placements(swing.mechanism, pinocchio_configurations(swing, rows))
+    shapes = find_link_shapes(swing.mechanism, moved)
     for k, row in enumerate(rows):
         one, two, three, four = swing.q_tree[row]
         elbows = [L1 * np.array([np.cos(a), np.sin(a)]) + [x, 0] for a, x in ((one, 0.0), (three, BASE))]
         tips = [
             e + L2 * np.array([np.cos(a), np.sin(a)]) for e, a in zip(elbows, (one + two, three + four), strict=True)
         ]
-        drawn = project_outline(swing.mechanism, moved.select_row(k), plane)
+        drawn = project_outline(swing.mechanism, shapes, moved.select_row(k), plane)
         expected = [[[0, 0], elbows[0]], [elbows[0], tips[0]], [[BASE, 0], elbows[1]], [elbows[1], tips[1]]]
         for bar in expected:
             assert min(np.abs(drawn_bar - np.array(bar)).max() for drawn_bar in drawn.bars) < 1e-9
         for ring in (*elbows, *tips, [0, 0], [BASE, 0]):
             assert np.abs(drawn.rings - ring).max(axis=1).min() < 1e-9
         assert drawn.blocks == []
-    assert [bar.tolist() for bar in project_base(swing.mechanism, moved, plane)[0]] == [[[0, 0], [BASE, 0]]]
+    assert project_base(shapes, plane).ground.tolist() == [[0, 0], [BASE, 0]]
 
 
 def test_slider_moves_along_its_rail() -> None:
@@ -72,11 +69,15 @@ def test_slider_moves_along_its_rail() -> None:
     run = simulate("slider_crank", {"t_end": 0.3})
     moved = compute_placements(mechanism, pinocchio_configurations(run))
     (plane,) = projection_planes(mechanism)
+    shapes = find_link_shapes(mechanism, moved)
     middles = np.array(
-        [project_outline(mechanism, moved.select_row(k), plane).blocks[0].mean(axis=0) for k in range(len(run.t))]
+        [
+            project_outline(mechanism, shapes, moved.select_row(k), plane).blocks[0].mean(axis=0)
+            for k in range(len(run.t))
+        ]
     )
     np.testing.assert_allclose(middles, np.column_stack([run["slider"], np.zeros(len(run.t))]), atol=1e-12)
-    (rail,) = project_base(mechanism, moved, plane)[1]
+    (rail,) = project_base(shapes, plane).rails
     assert rail[:, 0].min() < middles[:, 0].min() < middles[:, 0].max() < rail[:, 0].max()
 
 
@@ -88,7 +89,8 @@ def test_frames_show_the_pose_at_their_time(swing: Run, tmp_path: Path) -> None:
     rows = [swing.at(k / 20) for k in range(11)]
     plane = projection_planes(swing.mechanism)[0]
     moved = compute_placements(swing.mechanism, pinocchio_configurations(swing, np.array(rows)))
-    bars = [project_outline(swing.mechanism, moved.select_row(k), plane).bars for k in range(11)]
+    shapes = find_link_shapes(swing.mechanism, moved)
+    bars = [project_outline(swing.mechanism, shapes, moved.select_row(k), plane).bars for k in range(11)]
     lengths = [np.linalg.norm(bar[1] - bar[0]) for bar in bars[0]]
     x, y = np.array([np.average([bar.mean(axis=0) for bar in each], axis=0, weights=lengths) for each in bars]).T
     one, none = np.ones(11), np.zeros(11)

@@ -226,16 +226,6 @@ def test_links_without_visuals_are_drawn_as_rods(tmp_path):
     np.testing.assert_allclose(placement @ [0, -0.25, 0, 1], [0, 0, 0, 1], atol=1e-12)
 
 
-def test_rail_is_as_long_as_the_slides_travel(tmp_path):
-    run = ckc_pin.simulate(write_scene(tmp_path / "m", ARM, "", START_OF_ARM, 0.3))
-    way = run.q_tree[:, run.column("reach$/1")]
-    ((path, rail),) = [(path, obj) for path, obj in objects(draw_runs_3d([run])).items() if "/rail:" in path]
-    assert "/joint:lift/" in path
-    placement, length = matrix(rail["object"]["matrix"]), rail["geometries"][0]["height"]
-    ends = sorted((placement @ [0, side * length / 2, 0, 1])[0] for side in (-1, 1))
-    np.testing.assert_allclose(ends, [0.2 + min(0, way.min()), 0.2 + max(0, way.max())], atol=1e-9)
-
-
 def test_links_of_equal_colour_get_distinct_colours(tmp_path):
     grey = '<material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>'
     ball = f'<visual><geometry><sphere radius="0.02"/></geometry>{grey}</visual>'
