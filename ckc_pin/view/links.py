@@ -174,13 +174,8 @@ def _add_slide(shapes: LinkShapes, slide: Slide, points: list[list[Array]], pose
     overlap = ROD_OVERLAP_RATIO * min_distance
     length = float(np.ptp(on_parent))
     if length <= FLATNESS_TOLERANCE * size:  # The file gives no length, so that of the stroke is taken.
-        length = float(
-            np.clip(
-                max_distance - min_distance + overlap,
-                MIN_CYLINDER_RATIO * min_distance,
-                MAX_CYLINDER_RATIO * min_distance,
-            )
-        )
+        bounds = MIN_CYLINDER_RATIO * min_distance, MAX_CYLINDER_RATIO * min_distance
+        length = float(np.clip(max_distance - min_distance + overlap, *bounds))
     start = slide.origin + on_parent.min() * parent_axis
     shapes.cylinders.append(Bar(slide.parent, start, start + length * parent_axis))
     rod_length = max(float(np.ptp(on_child)), max_distance - length + overlap, MIN_ROD_RATIO * min_distance)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import replace
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -141,13 +143,45 @@ def test_arrows_have_position_direction_and_ratio_of_forces(visit, runs):
 
 def test_all_controls_fit_a_small_screen(visit):
     visit.page.set_viewport_size({"width": 360, "height": 640})
-    for name in ("play", "time-slider", "time", "speed", "loop", "forces", "record"):
+    for name in ("play", "time-slider", "time", "speed", "loop", "forces", "controls", "record"):
         box = visit.page.locator(f"#{name}").bounding_box()
         assert 0 <= box["x"] < box["x"] + box["width"] <= 360
         assert box["y"] + box["height"] <= 640
     assert not visit.page.locator(".dg.main").is_visible()
-    visit.until("Math.abs(viewer.camera.zoom - 360 / 640) < 1e-9")
+    height = visit.page.locator("#meshcat-pane").bounding_box()["height"]
+    visit.until(f"Math.abs(viewer.camera.zoom - 360 / {height}) < 1e-9")
     assert visit.page.evaluate("document.documentElement.scrollWidth") == 360
+
+
+def test_play_button_shows_a_triangle_and_a_pause_sign(visit):
+    """Drawn pixels, whatever fonts the system has: the pause sign is two bars, the triangle one area."""
+
+    def count_areas() -> int:
+        image = matplotlib.image.imread(io.BytesIO(visit.page.locator("#play svg").screenshot()))
+        is_dark = image[image.shape[0] // 2, :, :3].mean(axis=1) < 0.5
+        return int(np.sum(np.diff(is_dark.astype(int)) == 1) + is_dark[0])
+
+    assert visit.page.inner_text("#play") == ""
+    assert (count_areas(), visit.page.get_attribute("#play", "aria-label")) == (1, "play")
+    visit.page.keyboard.press("Space")
+    assert (count_areas(), visit.page.get_attribute("#play", "aria-label")) == (2, "pause")
+
+
+def test_controls_of_the_viewer_are_shown_on_request(visit):
+    assert not visit.page.get_by_text("Open Controls").is_visible()
+    assert not visit.page.locator(".dg.main").is_visible()
+    visit.page.click("#controls")
+    assert visit.page.get_by_text("Scene", exact=True).is_visible()
+    assert not visit.page.get_by_text("Close Controls").is_visible()
+    visit.page.keyboard.press("h")
+    assert not visit.page.locator(".dg.main").is_visible()
+
+
+def test_bar_does_not_cover_the_mechanism(visit):
+    pane, bar = (visit.page.locator(name).bounding_box() for name in ("#meshcat-pane canvas", "#bar"))
+    assert pane["y"] + pane["height"] <= bar["y"]
+    assert bar["y"] + bar["height"] == 540
+    assert visit.page.evaluate("viewer.camera.aspect") == pytest.approx(pane["width"] / pane["height"])
 
 
 def test_video_is_recorded_as_webm(visit, tmp_path):

@@ -15,6 +15,10 @@ var player = (function () {
   const LAST_FRAME_MS = 300;  // how long a recording shows the final pose
   const TIME_TOLERANCE = 1e-6;  // relative; keyframes are rounded to single precision
 
+  // Drawn, because not every system has a font with these letters.
+  const PLAY_ICON = "M3 1 L14 8 L3 15 Z";
+  const PAUSE_ICON = "M3 1 H6.5 V15 H3 Z M9.5 1 H13 V15 H9.5 Z";
+
   const animator = viewer.animator;
   let runs = [];  // each with path, label, t_end, outcome, and its checkbox and outcome elements
   let forcePaths = [];
@@ -137,6 +141,15 @@ var player = (function () {
     if (forcePaths.length) { showForces(element("forces").getAttribute("aria-pressed") !== "true"); }
   }
 
+  function showControls(visible) {
+    viewer.gui.domElement.style.display = visible ? "" : "none";
+    element("controls").setAttribute("aria-pressed", String(visible));
+  }
+
+  function toggleControls() {
+    showControls(element("controls").getAttribute("aria-pressed") !== "true");
+  }
+
   function setRuns(newRuns, newForcePaths) {
     runs = newRuns;
     forcePaths = newForcePaths;
@@ -172,16 +185,17 @@ var player = (function () {
     line.replaceChildren(label);
   }
 
-  function fitCamera() {  // The camera is placed for a square view; zoom out where the page is narrower than high.
-    viewer.camera.zoom = Math.min(1, window.innerWidth / window.innerHeight);
-    viewer.camera.updateProjectionMatrix();
-    viewer.set_dirty();
-  }
+  // The viewer takes the window's height; the bar below the picture needs a part of it.
+  viewer.set_3d_pane_size = function () {
+    const pane = element("meshcat-pane");
+    viewer.camera.zoom = Math.min(1, pane.offsetWidth / pane.offsetHeight);  // The camera is placed for a square view.
+    MeshCat.Viewer.prototype.set_3d_pane_size.call(viewer, pane.offsetWidth, pane.offsetHeight);
+  };
 
   function startAnimation(options, times) {
     outputTimes = times;
-    fitCamera();
     element("bar").hidden = false;
+    viewer.set_3d_pane_size();
     element("time-slider").max = animator.duration;
     setSpeed(options.timeScale);
     isPlaying = animator.playing;
@@ -192,7 +206,8 @@ var player = (function () {
     const time = animator.time;
     element("time-slider").value = time;
     element("time").textContent = time.toFixed(2) + " / " + animator.duration.toFixed(2) + " s";
-    element("play").textContent = animator.playing ? "\u23F8\uFE0E" : "\u25B6\uFE0E";
+    element("play").setAttribute("aria-label", animator.playing ? "pause" : "play");
+    element("play").querySelector("path").setAttribute("d", animator.playing ? PAUSE_ICON : PLAY_ICON);
     runs.forEach(function (run) {
       const hasEnded = time >= run.t_end - TIME_TOLERANCE * Math.max(1, run.t_end);
       const text = run.outcome && hasEnded ? " \u2013 " + run.outcome : "";
@@ -262,6 +277,7 @@ var player = (function () {
     "l": function () { setLoop(!isLooping); },
     "r": toggleRecording,
     "f": toggleForces,
+    "h": toggleControls,
     "arrowleft": function (event) { step(-1, event.shiftKey); },
     "arrowright": function (event) { step(1, event.shiftKey); },
     "arrowup": function () { changeSpeed(1); },
@@ -295,10 +311,10 @@ var player = (function () {
 
   // Capturing the event comes before the viewer's own keys, which move the camera.
   document.addEventListener("keydown", handleKey, true);
-  window.addEventListener("resize", fitCamera);
   connectButton("play", togglePlay);
   connectButton("loop", KEY_ACTIONS.l);
   connectButton("forces", toggleForces);
+  connectButton("controls", toggleControls);
   connectButton("record", toggleRecording);
   element("time-slider").oninput = function () {
     if (isPlaying) { pause(); }
@@ -308,6 +324,7 @@ var player = (function () {
     setSpeed(Number(element("speed").value));
     element("speed").blur();
   };
+  showControls(false);
   setTimeout(function () { requestAnimationFrame(followAnimation); });
   return {seek: seek, play: play, pause: pause, setRuns: setRuns, startAnimation: startAnimation};
 })();
@@ -333,4 +350,4 @@ viewer.handle_command = function (command) {
   }
 };
 viewer.gui.__folders["Scene"].close();
-viewer.gui.close();
+viewer.gui.open();
