@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
@@ -207,6 +208,7 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
         "ckc play runs/reduced runs/spf --speed 0.5 --gap 1000",
         "ckc play runs/spf --html spf.html",
         "ckc play runs/reduced runs/spf --video both.gif",
+        "ckc play runs/spf --video spf.gif --size 960x540 --fps 30",
     )
 )
 @options.runs
@@ -219,6 +221,8 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
     type=options.PATH,
     help="Write an animated line drawing instead, as GIF. The player in the browser records other formats.",
 )
+@click.option("--size", metavar="WIDTHxHEIGHT", help="Pixels of the video; default: 480 wide, high as needed.")
+@click.option("--fps", metavar="N", type=float, help="Frames per second of the video, 1 to 50; default: 20.")
 @click.option("--speed", metavar="FACTOR", type=float, default=1.0, help="Playback speed, 1 is real time.")
 @click.option("--gap", metavar="FACTOR", type=float, default=0.0, help="Draw the loops' gaps, magnified by a factor.")
 @click.option("--forces", is_flag=True, help="Draw the forces of loops and motors as arrows.")
@@ -229,6 +233,8 @@ def play(
     runs: tuple[Path, ...],
     html: Path | None,
     video: Path | None,
+    size: str | None,
+    fps: float | None,
     speed: float,
     gap: float,
     forces: bool,
@@ -244,13 +250,18 @@ def play(
             f"ffmpeg -i {video.with_suffix('.gif').name} {video.name} converts it"
         )
     if video is not None and (html is not None or gap or forces or meshes is not None):
-        raise InputError("--video goes with --speed only; leave out --html, --gap, --forces and --meshes")
+        raise InputError(
+            "--video goes with --size, --fps and --speed only; leave out --html, --gap, --forces and --meshes"
+        )
+    if video is None and (size is not None or fps is not None):
+        raise InputError(f"{'--fps' if size is None else '--size'} goes with --video FILE; give both")
+    pixels = None if size is None else _read_size(size)
     loaded = [ckc_pin.Run.load(path) for path in runs]
     if video is not None:
-        from ckc_pin.view.gif import save_gif
+        from ckc_pin.view.gif import FRAMES_PER_SECOND, save_gif
 
         with Spinner(f"writing {video.name}"):
-            path = save_gif(loaded, video, speed=speed)
+            path = save_gif(loaded, video, speed=speed, size=pixels, fps=FRAMES_PER_SECOND if fps is None else fps)
         print_written([path])
         return
     if html is None:
@@ -261,3 +272,10 @@ def play(
     with Spinner(f"writing {html.name}"):
         path = save_html(loaded, html, speed=speed, gap=gap, meshes=meshes, forces=forces)
     print_written([path])
+
+
+def _read_size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,9})[xX×](\d{1,9})", text)
+    if match is None:
+        raise InputError(f"--size {text}: expected width and height in pixels, such as 960x540")
+    return int(match[1]), int(match[2])

@@ -10,6 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
@@ -30,11 +31,15 @@ from ckc_pin.view.player import require_parent_folder, require_playable_runs
 from ckc_pin.view.run_group import compute_desired_poses
 from ckc_pin.view.style import escape_mathtext, figure_style, label_runs
 
-__all__ = ["quantize_frames", "save_gif"]
+__all__ = ["FRAMES_PER_SECOND", "quantize_frames", "save_gif"]
 
-FRAMES_PER_SECOND = 20  # GIF measures frame times in hundredths of a second
+FRAMES_PER_SECOND = 20.0  # by default
+MIN_FRAMES_PER_SECOND, MAX_FRAMES_PER_SECOND = 1, 50  # Browsers slow down frames shorter than 0.02 s.
 MAX_FRAMES = 1200
+MAX_PIXELS = MAX_FRAMES * 480 * 600  # of all frames together, for the memory they take
 LAST_FRAME_MS = 1000
+MIN_SIDE_PX, MAX_SIDE_PX = 120, 3840
+# The width of the default size and the limits of its height; letters and lines of other sizes are scaled.
 WIDTH_IN, MIN_HEIGHT_IN, MAX_HEIGHT_IN = 4.8, 2.2, 6.0
 DPI = 100
 PLATE_ALPHA = 0.2
@@ -42,8 +47,15 @@ PALETTE_SIZE = 64
 PALETTE_FRAMES = 5  # frames that the palette is computed from
 
 
-def save_gif(runs: Run | Sequence[Run], path: str | Path, *, speed: float = 1.0) -> Path:
-    """Write runs as an animated GIF that shows bars, hinges and slides.
+def save_gif(
+    runs: Run | Sequence[Run],
+    path: str | Path,
+    *,
+    speed: float = 1.0,
+    size: tuple[int, int] | None = None,
+    fps: float = FRAMES_PER_SECOND,
+) -> Path:
+    """Write runs as an animated GIF that shows links, hinges and slides.
 
     Planar mechanisms are drawn on their plane, other mechanisms obliquely from above.
 
@@ -54,28 +66,60 @@ def save_gif(runs: Run | Sequence[Run], path: str | Path, *, speed: float = 1.0)
     path : str or Path
     speed : float
         Simulated seconds per second of playback.
+    size : (width, height), optional
+        Pixels, 120 to 3840 each. Default: 480 wide, as high as the mechanism needs.
+    fps : float
+        Frames per second of playback, 1 to 50.
 
     Raises
     ------
     InputError
-        As for `play_runs`; the file cannot be written; more than 1200 frames of 1/20 s; matplotlib is not installed.
+        As for `play_runs`; an invalid size or frame rate; the file cannot be written; more than 1200 frames, or too
+        many pixels in all of them; matplotlib is not installed.
     """
     ordered = require_playable_runs(runs, speed)
+    _require_size(size)
+    if not (is_number(fps) and MIN_FRAMES_PER_SECOND <= fps <= MAX_FRAMES_PER_SECOND):
+        raise InputError(
+            f"video: fps = {describe_value(fps)}; a GIF shows {MIN_FRAMES_PER_SECOND} to {MAX_FRAMES_PER_SECOND} "
+            "frames per second"
+        )
     file = require_parent_folder(path, "save_gif: path")
     t_end = max(float(run.t[-1]) for run in ordered)
-    count = int(np.ceil(t_end * FRAMES_PER_SECOND / speed)) + 1
+    count = int(np.ceil(t_end * fps / speed)) + 1
     if count > MAX_FRAMES:
         raise InputError(
-            f"save_gif: {t_end:g} s at speed {speed:g} need {count} frames, but a GIF may have {MAX_FRAMES}; "
-            f"choose speed {t_end * FRAMES_PER_SECOND / (MAX_FRAMES - 1):.2g} or more"
+            f"video: {t_end:g} s at speed {speed:g} and {fps:g} frames per second need {count} frames, but a GIF may "
+            f"have {MAX_FRAMES}; choose speed {_round_up(t_end * fps / (MAX_FRAMES - 1)):g} or more, or fewer frames "
+            "per second"
         )
-    times = np.minimum(np.arange(count) * speed / FRAMES_PER_SECOND, t_end)
+    times = np.minimum(np.arange(count) * speed / fps, t_end)
     with figure_style():
-        frames = _Animation(ordered, times, speed).render()
-    durations = [1000 // FRAMES_PER_SECOND] * (count - 1) + [LAST_FRAME_MS]
+        frames = _Animation(ordered, times, speed, size).render()
+    # GIF measures in hundredths of a second; rounding the instants keeps the average rate exact.
+    durations = 10 * np.diff(np.round(100 * np.arange(count) / fps)).astype(int)
     with open_atomic(file) as stream:
-        frames[0].save(stream, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
+        frames[0].save(stream, "GIF", save_all=True, append_images=frames[1:],
+                       duration=[*durations.tolist(), LAST_FRAME_MS], loop=0)  # fmt: skip
     return file
+
+
+def _require_size(size: Any) -> None:
+    if size is None:
+        return
+    is_pair = isinstance(size, tuple | list) and len(size) == 2 and all(isinstance(x, int) for x in size)
+    if not (is_pair and all(MIN_SIDE_PX <= x <= MAX_SIDE_PX for x in size)):
+        value = f"{size[0]} x {size[1]}" if is_pair else describe_value(size)
+        raise InputError(
+            f"video: size = {value}; expected width and height in pixels, two integers from {MIN_SIDE_PX} "
+            f"to {MAX_SIDE_PX}"
+        )
+
+
+def _round_up(value: float) -> float:
+    """Round up to two digits."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.ceil(value / unit - 1e-9) * unit)
 
 
 def quantize_frames(images: Sequence[Any]) -> list[Any]:
@@ -128,7 +172,7 @@ class _MovingOutline:
 class _Animation:
     """A figure that is drawn once per frame."""
 
-    def __init__(self, runs: list[Run], times: Array, speed: float) -> None:
+    def __init__(self, runs: list[Run], times: Array, speed: float, size: tuple[int, int] | None) -> None:
         mechanism = runs[0].mechanism
         self.runs, self.times = runs, times
         oblique = Projection("", compute_view_axes(mechanism)[:2], ("", ""))
@@ -141,7 +185,9 @@ class _Animation:
         paths = [self.plane.axes @ path.T for run in runs for path in run.points.values()]
         moving_points = [x for frames in outlines for frame in frames
                          for x in (*frame.bars, *frame.plates, frame.rings, *frame.blocks)]  # fmt: skip
-        self._create_figure(np.vstack([base.ground, *base.rails, *(path.T for path in paths), *moving_points]), speed)
+        self._create_figure(
+            np.vstack([base.ground, *base.rails, *(path.T for path in paths), *moving_points]), speed, size
+        )
         draw_base(self.ax, base)
         for path in paths:
             self.ax.plot(*path, color=style.GREY, linewidth=0.8, linestyle=":")
@@ -158,14 +204,26 @@ class _Animation:
             handles.append(legend_line(style.REST_COLOUR, "desired"))
         fit_legend(self.figure, handles)
 
-    def _create_figure(self, points: Array, speed: float) -> None:
+    def _create_figure(self, points: Array, speed: float, size: tuple[int, int] | None) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         low, high = points.min(axis=0), points.max(axis=0)
         low, high = low - 0.06 * (high - low).max(), high + 0.06 * (high - low).max()
-        height = float(np.clip(WIDTH_IN * (high - low)[1] / (high - low)[0] + 0.7, MIN_HEIGHT_IN, MAX_HEIGHT_IN))
-        self.figure = Figure(figsize=(WIDTH_IN, height), dpi=DPI, layout="constrained")
+        if size is None:
+            height = WIDTH_IN * (high - low)[1] / (high - low)[0] + 0.7
+            size = (round(DPI * WIDTH_IN), round(DPI * float(np.clip(height, MIN_HEIGHT_IN, MAX_HEIGHT_IN))))
+        width_px, height_px = size
+        pixels = len(self.times) * width_px * height_px
+        if pixels > MAX_PIXELS:
+            raise InputError(
+                f"video: {len(self.times)} frames of {width_px} x {height_px} pixels are {pixels / MAX_PIXELS:.2g} "
+                "times as much as a GIF may have; choose a smaller size, fewer frames per second or a higher speed"
+            )
+        dpi = min(width_px / WIDTH_IN, height_px / MIN_HEIGHT_IN)
+        height = height_px / dpi
+        # The canvas rounds down to whole pixels.
+        self.figure = Figure(((width_px + 0.01) / dpi, (height_px + 0.01) / dpi), dpi=dpi, layout="constrained")
         self.canvas: Any = FigureCanvasAgg(self.figure)
         subtitle = "" if speed == 1 else f"{speed:g} × real time"
         add_header(self.figure, escape_mathtext(self.runs[0].scene_name), subtitle)

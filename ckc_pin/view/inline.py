@@ -16,7 +16,7 @@ from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.run.run import Run
 from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view.figures import draw_runs, write_figures
-from ckc_pin.view.gif import save_gif
+from ckc_pin.view.gif import FRAMES_PER_SECOND, save_gif
 from ckc_pin.view.linear_figures import draw_linear
 from ckc_pin.view.player import render_html, write_page
 from ckc_pin.view.result_figures import draw_motion_forces, draw_sensitivities
@@ -116,16 +116,27 @@ class Playback:
             'style="border: 1px solid #ddd"></iframe>'
         )
 
-    def save(self, path: str | Path) -> Path:
+    def save(self, path: str | Path, *, size: tuple[int, int] | None = None, fps: float | None = None) -> Path:
         """Write an HTML file that plays from disk without a network, or a GIF if the name ends in .gif.
+
+        Parameters
+        ----------
+        path : str or Path
+        size : (width, height), optional
+            Of a GIF, pixels. Default: 480 wide, as high as the mechanism needs.
+        fps : float, optional
+            Frames per second of a GIF, 1 to 50. Default: 20.
 
         Raises
         ------
         InputError
-            As for `save_html` and `save_gif`.
+            As for `save_html` and `save_gif`; a size or frame rate of an HTML file.
         """
         if str(path).lower().endswith(".gif"):
-            return save_gif(self._runs, path, speed=self._speed)
+            rate = FRAMES_PER_SECOND if fps is None else fps
+            return save_gif(self._runs, path, speed=self._speed, size=size, fps=rate)
+        if size is not None or fps is not None:
+            raise InputError("save: size and fps are those of a GIF; give a path that ends in .gif, or leave them out")
         return write_page(self.html, path)
 
 

@@ -121,9 +121,17 @@ def test_command_and_notebook_write_gifs(swing: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--html", "x.html"], "--video goes with --speed only"),
-        (["--forces"], "--video goes with --speed only"),
-        (["--speed", "0.001"], "10001 frames, but a GIF may have 1200; choose speed 0.0083 or more"),
+        (["--html", "x.html"], "--video goes with --size, --fps and --speed only"),
+        (["--forces"], "--video goes with --size, --fps and --speed only"),
+        (["--speed", "0.001"], "10001 frames, but a GIF may have 1200; choose speed 0.0084 or more"),
+        (["--size", "wide"], "--size wide: expected width and height in pixels, such as 960x540"),
+        (["--size", "960"], "--size 960: expected width and height in pixels, such as 960x540"),
+        (["--size", "0x540"], "size = 0 x 540; expected width and height in pixels, two integers from 120 to 3840"),
+        (["--size", "960x9999"], "expected width and height in pixels, two integers from 120 to 3840"),
+        (["--size", "3840x3840", "--fps", "50"], "26 frames of 3840 x 3840 pixels are 1.1 times as much as a GIF may"),
+        (["--fps", "60"], "fps = 60.0; a GIF shows 1 to 50 frames per second"),
+        (["--fps", "0"], "fps = 0.0; a GIF shows 1 to 50 frames per second"),
+        (["--fps", "nan"], "fps = nan; a GIF shows 1 to 50 frames per second"),
         (["--gif", "nowhere/x.gif"], "nowhere/x.gif: cannot be written"),
     ],
 )
@@ -133,6 +141,38 @@ def test_invalid_gif_options_are_rejected(options: list[str], says: str, swing: 
     assert answer.code == 2
     assert says in answer.err
     assert not (tmp_path / "own.gif").exists()
+
+
+@pytest.mark.parametrize("option", [["--size", "640x480"], ["--fps", "10"]])
+def test_options_of_a_video_need_a_video(option: list[str], swing: Run, tmp_path: Path) -> None:
+    swing.save(tmp_path / "run.npz")
+    answer = ckc("play", str(tmp_path / "run.npz"), *option, "--html", str(tmp_path / "x.html"))
+    assert answer.code == 2
+    assert answer.err == f"error: {option[0]} goes with --video FILE; give both\n"
+    with pytest.raises(InputError, match=r"size and fps are those of a GIF; give a path that ends in \.gif"):
+        ckc_pin.play(swing, inline=True).save(tmp_path / "x.html", fps=10)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (333, 777), (1001, 200), (120, 120)])
+def test_gif_has_the_given_size(size: tuple[int, int], tmp_path: Path) -> None:
+    """In every frame, the blue links have the same ratio of width to height whatever the size: nothing is distorted."""
+    swing = simulate("five_bar/swing", {"t_end": 0.05})
+    ratios = []
+    for one in (None, size):
+        (first, *_) = pictures = frames(save_gif(swing, tmp_path / "a.gif", size=one))
+        assert one is None or {picture.size for picture in pictures} == {one}
+        rows, columns = np.nonzero(np.abs(np.asarray(first.convert("RGB")).astype(int) - BLUE).max(axis=2) < 60)
+        ratios.append(np.ptp(columns) / np.ptp(rows))
+    assert ratios[1] == pytest.approx(ratios[0], rel=0.1)
+
+
+@pytest.mark.parametrize("fps", [1, 7.5, 30, 50])
+def test_gif_has_the_given_frames_per_second(fps: float, swing: Run, tmp_path: Path) -> None:
+    """Frame k is due at k / fps, within half of GIF's hundredth of a second."""
+    durations = [frame.info["duration"] for frame in frames(save_gif(swing, tmp_path / "a.gif", fps=fps))]
+    assert len(durations) == int(np.ceil(0.5 * fps)) + 1
+    due = np.concatenate([[0], np.cumsum(durations[:-1])])
+    np.testing.assert_allclose(due, 1000 * np.arange(len(durations)) / fps, atol=5.0)
 
 
 def test_runs_of_two_mechanisms_are_rejected(swing: Run, tmp_path: Path) -> None:
