@@ -10,6 +10,7 @@ import ckc_pin
 from scripts.site.domain import CkcDomain
 from scripts.site.formulas import setup_formulas
 from scripts.site.insert import inserted
+from scripts.site.search_texts import setup_search
 
 project = "ckc_pin"
 author = "the ckc_pin authors"
@@ -50,6 +51,7 @@ BARS = re.compile(r"(`[^`]*`)|[|]")  # of |phi|, a norm: Sphinx takes them for s
 def setup(app):
     app.add_domain(CkcDomain)
     setup_formulas(app)
+    setup_search(app)
     app.connect("source-read", insert)
     app.connect("autodoc-process-docstring", escape_bars)
 

@@ -6,12 +6,15 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import quote, urlsplit
 
 import pytest
-from playwright.sync_api import Browser
+from docutils import nodes
+from playwright.sync_api import Browser, Page
 
 from scripts.site.gallery import ROOT, examples
 from scripts.site.links import broken
+from scripts.site.search_texts import read_page_text
 from tests.browser.pages import PATIENCE, browser
 
 __all__ = ["browser"]  # a fixture
@@ -85,3 +88,65 @@ def test_search_finds_key_by_its_unit(site: Path, browser: Browser) -> None:
     assert "frequency" in key
     assert "rad/s" in key
     page.context.close()
+
+
+def search(site: Path, page: Page, query: str) -> list[dict[str, str]]:
+    """Search from disk; return title, excerpt and address of each result."""
+    page.goto(f"{(site / 'search.html').as_uri()}?q={quote(query)}")
+    page.locator("#search-results li").first.wait_for(timeout=PATIENCE * 1e3)
+    page.get_by_text("Search finished").wait_for(timeout=PATIENCE * 1e3)
+    results: list[dict[str, str]] = page.evaluate(
+        """() => Array.from(document.querySelectorAll("#search-results li")).map(item => ({
+             title: item.querySelector("a").textContent, address: item.querySelector("a").href,
+             excerpt: item.querySelector("p.context").textContent}))"""
+    )
+    return results
+
+
+def test_search_from_disk_shows_excerpts_with_the_query(site: Path, browser: Browser) -> None:
+    page = browser.new_context(offline=True).new_page()
+    requests: list[str] = []
+    page.on("request", lambda request: requests.append(request.url))
+    for query in ("rad/s", "friction", "--video"):
+        results = search(site, page, query)
+        assert results
+        assert [r for r in results if query not in f"{r['title']} {r['excerpt']}".lower()] == []
+        assert [r for r in results if not 10 < len(r["excerpt"]) <= 250] == []
+    assert [url for url in requests if not url.startswith("file:")] == []
+    page.context.close()
+
+
+def test_search_for_a_unit_ranks_keys_of_that_unit_first(site: Path, browser: Browser) -> None:
+    """Pages that have "rad" and an "s" somewhere are not results, nor are keys in rad/s² alone."""
+    page = browser.new_context(offline=True).new_page()
+    results = search(site, page, "rad/s")
+    is_key = ["rad/s" in result["title"] for result in results]
+    assert sum(is_key) > 5
+    assert is_key == sorted(is_key, reverse=True)
+    assert not [result for result in results if "rad/s²" in result["title"]]
+    for result in results[sum(is_key) :]:
+        file = urlsplit(result["address"]).path
+        assert re.search(r"rad/s(?![²\w])", re.sub(r"<[^>]+>", "", Path(file).read_text(encoding="utf-8")))
+    assert search(site, page, "friction")[0]["title"].startswith("joint.friction")
+    page.context.close()
+
+
+@pytest.mark.parametrize("width", [390, 1100, 1280, 1600])
+def test_no_line_of_code_is_cut_off(site: Path, browser: Browser, width: int) -> None:
+    page = browser.new_context(offline=True, viewport={"width": width, "height": 900}).new_page()
+    for path in ("start.html", "gallery.html", "guide/events.html", "guide/control.html", "reference/errors.html"):
+        page.goto((site / path).as_uri())
+        cut = page.evaluate(
+            """() => Array.from(document.querySelectorAll("pre")).filter(block => block.scrollWidth > block.clientWidth)
+                 .map(block => block.textContent.slice(0, 80))"""
+        )
+        assert cut == []
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+    page.context.close()
+
+
+def test_anchors_of_page_texts_are_where_their_text_begins() -> None:
+    section = nodes.section("", nodes.title("", "Second part"), nodes.paragraph("", "has x^2 rad/s."), ids=["second"])
+    doctree = nodes.document(None, None)
+    doctree += [nodes.title("", "First"), nodes.math_block("", "x^2"), section]
+    assert read_page_text(doctree) == {"text": "First\nSecond part\nhas x^2 rad/s.", "anchors": {"second": 6}}
