@@ -31,6 +31,11 @@ class Example:
         """Path of its picture in docs/."""
         return ROOT / "docs" / PICTURES / f"{self.name}.png"
 
+    @property
+    def thumbnail(self) -> Path:
+        """Path of its thumbnail in docs/."""
+        return ROOT / "docs" / PICTURES / "small" / f"{self.name}.png"
+
 
 def examples() -> list[Example]:
     """Return the examples in the order of their names."""
@@ -56,9 +61,9 @@ def markdown() -> str:
     gallery = examples()
     if not gallery:
         return ""
-    lines = ["::::{grid} 2 2 3 3", ":gutter: 2", ""]
+    lines = ["::::{grid} 1 2 3 3", ":gutter: 2", ""]
     for example in gallery:
-        lines += [f":::{{grid-item-card}} {example.title}", f":img-top: {PICTURES}/{example.name}.png"]
+        lines += [f":::{{grid-item-card}} {example.title}", f":img-top: {PICTURES}/small/{example.name}.png"]
         lines += [f":link: example-{example.name}", ":link-type: ref", ":::", ""]
     lines += ["::::", ""]
     for example in gallery:

@@ -2,45 +2,58 @@
 
 from __future__ import annotations
 
-import re
+import ast
+import json
 import sys
-from base64 import b64decode
 from importlib import import_module
-from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 from scripts.experiments.chart import shrink
 from scripts.site.gallery import Example, examples
+from scripts.site.thumbnail import reduce_to_thumbnail
 
-__all__ = ["main", "picture", "run"]
+__all__ = ["main", "run", "write_pictures"]
 
 DPI = 150  # makes a figure of seven inches slightly sharper than a page's column needs
+THUMBNAIL_DPI = 200  # for cards of up to 300 pixels on screens with two pixels for each
 
 
 def run(example: Example) -> Any:
-    """Run an example in Python and return its figure; raise AssertionError if the example is invalid."""
+    """Run an example and return its figure, of a notebook the first one; AssertionError if the example is invalid."""
+    if example.path.suffix == ".ipynb":
+        return _run_notebook(example.path)
     return import_module(f"examples.{example.name}").main()
 
 
-def picture(example: Example) -> bytes:
-    """Run an example and return its picture as PNG; for a notebook, the first picture of its outputs."""
-    if example.path.suffix == ".ipynb":
-        return _first_shown(example)
-    drawn = BytesIO()
-    run(example).savefig(drawn, dpi=DPI)
-    return drawn.getvalue()
+def _run_notebook(path: Path) -> Any:
+    """Run the cells of a notebook up to the first whose last value is figures."""
+    from ckc_pin.view.inline import Figures
+
+    namespace: dict[str, Any] = {}
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] != "code":
+            continue
+        tree = ast.parse("".join(cell["source"]))
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        exec(compile(tree, str(path), "exec"), namespace)
+        value = eval(compile(ast.Expression(last.value), str(path), "eval"), namespace) if last else None
+        if isinstance(value, Figures):
+            return next(iter(value.values()))
+    raise AssertionError(f"{path}: a notebook shows a figure")
 
 
-def _first_shown(example: Example) -> bytes:
-    import nbformat
-    from nbclient import NotebookClient
-
-    notebook = nbformat.read(example.path, as_version=4)  # type: ignore[no-untyped-call]
-    NotebookClient(notebook, timeout=120).execute()
-    shown = "".join(str(output.get("data", {})) for cell in notebook.cells for output in cell.get("outputs", []))
-    match = re.search(r"data:image/png;base64,([\w+/=]+)", shown)
-    assert match, "a notebook shows a figure"
-    return b64decode(match[1])
+def write_pictures(example: Example) -> list[Path]:
+    """Run an example, write its picture and its thumbnail, and return their paths."""
+    figure = run(example)
+    example.thumbnail.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(example.picture, dpi=DPI)
+    reduce_to_thumbnail(figure)
+    figure.savefig(example.thumbnail, dpi=THUMBNAIL_DPI)
+    paths = [example.picture, example.thumbnail]
+    for path in paths:
+        shrink(path)
+    return paths
 
 
 def main() -> None:
@@ -50,10 +63,8 @@ def main() -> None:
     mpl.use("Agg")
     for example in examples():
         if not sys.argv[1:] or example.name in sys.argv[1:]:
-            example.picture.parent.mkdir(parents=True, exist_ok=True)
-            example.picture.write_bytes(picture(example))
-            shrink(example.picture)
-            print(f"written: {example.picture}")
+            for path in write_pictures(example):
+                print(f"written: {path}")
 
 
 if __name__ == "__main__":

@@ -76,6 +76,17 @@ def test_gallery_has_every_example(site: Path) -> None:
     ] == []
 
 
+def test_gallery_cards_show_thumbnails_sharply(site: Path, browser: Browser) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto((site / "gallery.html").as_uri())
+    sizes = page.evaluate(
+        """() => Array.from(document.querySelectorAll(".sd-card-img-top")).map(i => [i.naturalWidth, i.clientWidth])"""
+    )
+    assert len(sizes) == len(examples())
+    assert all(2 * shown <= natural for natural, shown in sizes)
+    page.close()
+
+
 def test_search_finds_key_by_its_unit(site: Path, browser: Browser) -> None:
     """Searched from disk, in a browser without network; the result links to the key."""
     page = browser.new_context(offline=True).new_page()
