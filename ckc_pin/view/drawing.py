@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.view import bodies, commands
@@ -73,7 +74,9 @@ def draw_runs_3d(
     rows = [_select_keyframes(run.t, speed) for run in runs]
     configurations = [pinocchio_configurations(run, selected) for run, selected in zip(runs, rows, strict=True)]
     motions = [compute_placements(run.mechanism, q) for run, q in zip(runs, configurations, strict=True)]
-    drawing = set_camera(runs[0].mechanism, motion_extent(runs[0].mechanism, motions))
+    desired = _find_desired_pose(runs, rows)
+    extent = motion_extent(runs[0].mechanism, [*motions, desired.poses] if desired else motions)
+    drawing = set_camera(runs[0].mechanism, extent)
     tracks: list[Track] = []
     for k, (run, selected, q, poses) in enumerate(zip(runs, rows, configurations, motions, strict=True)):
         root, appearance, t = _run_path(runs, k), _run_appearance(k), run.t[selected]
@@ -87,7 +90,8 @@ def draw_runs_3d(
         if gap > 0:
             drawing += bodies.draw_gaps(run.mechanism, root, appearance)
             tracks += _create_gap_tracks(run.mechanism, root, t, q, poses, gap)
-    _add_desired_pose(runs, rows, drawing, tracks, meshes)
+    if desired:
+        _add_desired_pose(runs, rows, desired, drawing, tracks, meshes)
     if forces:
         _add_forces(runs, rows, motions, drawing, tracks)
     entries = [{"path": _run_path(runs, k), "label": label, "t_end": float(run.t[-1]), "outcome": _format_outcome(run)}
@@ -126,21 +130,35 @@ def _add_forces(
         drawing.append(commands.set_status(f"long arrows: {', '.join(sizes)}"))
 
 
-def _add_desired_pose(
-    runs: Sequence[Run], rows: Sequence[IntArray], drawing: list[Command], tracks: list[Track], meshes: Path | None
-) -> None:
-    """Add the desired pose of the first controlled run as a ghost, hidden while that pose is unreachable."""
+@dataclass(frozen=True)
+class _DesiredPose:
+    """The desired poses of run k at its keyframes (m), and whether they are reachable, (m,) of bool."""
+
+    k: int
+    poses: Placements
+    is_reachable: BoolArray
+
+
+def _find_desired_pose(runs: Sequence[Run], rows: Sequence[IntArray]) -> _DesiredPose | None:
+    """Return the desired poses of the first controlled run."""
     for k, (run, selected) in enumerate(zip(runs, rows, strict=True)):
         desired = compute_desired_poses(run, selected)
-        if desired is None:
-            continue
-        root, t = f"{_run_path(runs, k)}/desired", run.t[selected]
-        poses = compute_placements(run.mechanism, desired.q_tree)
-        drawing += bodies.draw_bodies(run.mechanism, root, poses, bodies.GHOST, meshes)
-        tracks += _create_body_tracks(run.mechanism, root, t, poses)
-        if not desired.is_reachable.all():
-            tracks.append(Track(root, t, {"visible": desired.is_reachable}))
-        return
+        if desired is not None:
+            return _DesiredPose(k, compute_placements(run.mechanism, desired.q_tree), desired.is_reachable)
+    return None
+
+
+def _add_desired_pose(
+    runs: Sequence[Run], rows: Sequence[IntArray], desired: _DesiredPose, drawing: list[Command], tracks: list[Track],
+    meshes: Path | None,
+) -> None:  # fmt: skip
+    """Add the desired pose as a ghost, hidden while it is unreachable."""
+    run, root = runs[desired.k], f"{_run_path(runs, desired.k)}/desired"
+    t = run.t[rows[desired.k]]
+    drawing += bodies.draw_bodies(run.mechanism, root, desired.poses, bodies.GHOST, meshes)
+    tracks += _create_body_tracks(run.mechanism, root, t, desired.poses)
+    if not desired.is_reachable.all():
+        tracks.append(Track(root, t, {"visible": desired.is_reachable}))
 
 
 # --- animation -----------------------------------------------------------------------------------

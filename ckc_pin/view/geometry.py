@@ -13,7 +13,7 @@ from ckc_pin.mechanism.rows import Component, Distance
 from ckc_pin.run.run import Run
 
 __all__ = ["COINCIDENCE_TOLERANCE", "Placements", "Projection", "Slide", "compute_loop_gaps", "compute_placements",
-           "compute_view_axes", "find_body_points", "find_plane_normal", "find_position_loops", "find_slides",
+           "compute_view_axes", "find_body_points", "find_position_loops", "find_slides",
            "homogeneous", "is_planar", "pinocchio_configurations", "projection_planes", "up_direction"]  # fmt: skip
 
 PARALLEL_TOLERANCE = 1e-9  # sine of the angle below which two joint axes are parallel
@@ -125,7 +125,7 @@ def find_slides(mechanism: Mechanism) -> list[Slide]:
 
 def is_planar(mechanism: Mechanism) -> bool:
     """Return whether all bodies move in parallel planes."""
-    return find_plane_normal(mechanism) is not None
+    return _find_plane_normal(mechanism) is not None
 
 
 def up_direction(mechanism: Mechanism) -> Array:
@@ -141,7 +141,7 @@ def compute_view_axes(mechanism: Mechanism) -> Array:
     other mechanism is seen obliquely from above, with gravity pointing down.
     """
     up = up_direction(mechanism)
-    normal = find_plane_normal(mechanism)
+    normal = _find_plane_normal(mechanism)
     if normal is None:
         horizontal = np.eye(3)[int(np.argmin(np.abs(up)))]
         horizontal -= (horizontal @ up) * up
@@ -182,7 +182,7 @@ def _name_axis(direction: Array, default: str) -> str:
     return default
 
 
-def find_plane_normal(mechanism: Mechanism) -> Array | None:
+def _find_plane_normal(mechanism: Mechanism) -> Array | None:
     """Return the normal of a planar mechanism: all hinges are parallel to it, all slides perpendicular to it."""
     tree = mechanism.tree
     if tree.free_roots:

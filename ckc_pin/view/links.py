@@ -17,8 +17,8 @@ from ckc_pin.view.geometry import (
     Slide,
     compute_view_axes,
     find_body_points,
-    find_plane_normal,
     find_slides,
+    is_planar,
     up_direction,
 )
 
@@ -32,6 +32,7 @@ RAIL_MARGIN = 0.08  # of the mechanism's size: a rail is longer than the travel 
 MIN_CYLINDER_RATIO, MAX_CYLINDER_RATIO = 0.6, 0.95
 MIN_ROD_RATIO = 0.9
 ROD_OVERLAP_RATIO = 0.1  # of the rod inside its cylinder
+MAX_SLOPE_SINE = 0.1  # of the base's plane, if the ground is a plate in it
 GROUND_DISTANCE = 2.6  # of a planar mechanism's ground behind its links, in radii of a bar
 MIN_CYLINDER_LENGTH = 0.05  # of the mechanism's size; a shorter link with a slide is drawn as a rail
 
@@ -210,8 +211,8 @@ def find_ground(
 ) -> tuple[list[Bar | Plate], list[Bar]]:
     """Return the base's bar or plate, and the posts that connect it with pins and rails.
 
-    The ground of a planar mechanism is behind all links, so that no link crosses it. In space the ground is a plate
-    through its points if they are in one plane, else a floor below the mechanism.
+    The ground of a planar mechanism is behind all links, so that no link crosses it. In space it is a bar or a level
+    plate through its points, else a floor below the mechanism.
 
     Parameters
     ----------
@@ -219,10 +220,12 @@ def find_ground(
         Of a bar, m.
     """
     points = np.array(shapes.base_points).reshape(-1, 3)
-    normal = find_plane_normal(mechanism)
-    if normal is None and compute_rank(points, mechanism.size)[0] < 3:
+    up, is_flat = up_direction(mechanism), is_planar(mechanism)
+    rank, direction = compute_rank(points, mechanism.size)
+    is_level = rank < 2 or (rank == 2 and np.linalg.norm(np.cross(direction, up)) < MAX_SLOPE_SINE)
+    if is_level and not is_flat:
         return join_points(0, points, mechanism.size), []
-    towards_viewer = compute_view_axes(mechanism)[2] if normal is not None else up_direction(mechanism)
+    towards_viewer = compute_view_axes(mechanism)[2] if is_flat else up
     body_points = enumerate(find_body_points(mechanism))
     heights = [poses.point_positions(joint, x) @ towards_viewer for joint, each in body_points for x in each]
     level = min(map(np.min, heights)) - GROUND_DISTANCE * radius

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -231,6 +232,36 @@ def test_ground_of_a_planar_mechanism_is_behind_its_links(gravity: str, tmp_path
         pins = sorted(min(post, key=lambda end: abs(end[1])).round(9).tolist() for post in posts)
         assert pins == sorted([[0, 0, 0], [0.5, 0, 0], [0.2, 0, -0.4]][: len(posts)])
         assert all(max(away * post[:, 1]) >= nearest for post in posts)
+
+
+@pytest.mark.parametrize(("height", "posts"), [(0.0, 0), (0.5, 3)])
+def test_ground_in_space_is_a_level_plate_or_a_floor(height: float, posts: int, tmp_path: Path) -> None:
+    """Three arms on the base, two at z = 0, one higher; gravity along -z."""
+    arms = "".join(
+        f'<link name="link_{k}">{INERTIAL}</link><joint name="joint_{k}" type="continuous"><parent link="base"/>'
+        f'<child link="link_{k}"/><origin xyz="{xyz}"/><axis xyz="{axis}"/></joint>'
+        for k, (xyz, axis) in enumerate((("0 0 0", "0 0 1"), ("1 0 0", "0 1 0"), (f"0 1 {height}", "1 0 0")))
+    )
+    start = "[initial.q]\njoint_0 = 0.0\njoint_1 = 0.0\njoint_2 = 0.0\n"
+    run = simulate(tmp_path / "m", f'<robot name="m"><link name="base"/>{arms}</robot>', "", start, 0.02)
+    drawn = objects(run)
+    (plate,) = [obj for path, obj in drawn.items() if path.startswith("base/plate")]
+    assert len([path for path in drawn if path.startswith("base/post")]) == posts
+    low, high = bounds(plate, 2)
+    assert high - low < 2 * RADIUS * run.mechanism.size, "level"
+    assert high < 0 if posts else low < 0 < high
+
+
+def test_camera_has_the_desired_motion_in_view(run: Callable[..., ckc_pin.Run]) -> None:
+    """The desired pose begins far from the actual one, 1.4 rad; its elbow is at 0.6 m to the right, 0 m."""
+    short = run("five_bar/tracking", t_end=0.02)
+    drawing = draw_runs_3d([short])
+    view = np.array(next(c["matrix"] for c in drawing if c.get("path") == "/world")).reshape(4, 4).T
+    (position,) = [c["value"] for c in drawing if c.get("property") == "position"]
+    (angle,) = [c["value"] for c in drawing if c.get("property") == "fov"]
+    half = np.linalg.norm(position) * np.tan(np.radians(angle / 2))
+    ghost_elbow = view @ [0.3048 + 0.2794, 0.0, 0.0, 1.0]
+    assert np.abs(ghost_elbow[[0, 2]]).max() < 0.95 * half
 
 
 def test_ground_of_three_points_is_projected_as_one_area() -> None:
