@@ -221,7 +221,7 @@ def plot(runs: tuple[Path, ...], out: Path) -> None:
     type=options.PATH,
     help="Write an animated line drawing instead, as GIF. The player in the browser records other formats.",
 )
-@click.option("--size", metavar="WIDTHxHEIGHT", help="Pixels of the video; default: 480 wide, high as needed.")
+@click.option("--size", metavar="SIZE", help="Pixels of the video, such as 960x540; default: 480 wide.")
 @click.option("--fps", metavar="N", type=float, help="Frames per second of the video, 1 to 50; default: 20.")
 @click.option("--speed", metavar="FACTOR", type=float, default=1.0, help="Playback speed, 1 is real time.")
 @click.option("--gap", metavar="FACTOR", type=float, default=0.0, help="Draw the loops' gaps, magnified by a factor.")

@@ -6,7 +6,7 @@ from typing import Any
 
 __all__ = ["reduce_to_thumbnail"]
 
-SIZE_IN = (3.0, 1.8)  # the ratio of the gallery's cards
+SIZE_IN = (3.0, 1.8)  # the ratio of the places in the gallery
 INNER_BOX = (0.03, 0.05, 0.94, 0.90)  # of the axes: left, bottom, width, height as fractions
 
 

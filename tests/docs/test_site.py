@@ -76,7 +76,7 @@ def test_gallery_has_every_example(site: Path) -> None:
     ] == []
 
 
-def test_gallery_cards_show_thumbnails_sharply(site: Path, browser: Browser) -> None:
+def test_gallery_shows_thumbnails_sharply(site: Path, browser: Browser) -> None:
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     page.goto((site / "gallery.html").as_uri())
     sizes = page.evaluate(
