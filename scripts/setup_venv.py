@@ -1,15 +1,23 @@
 """Make .venv: exact versions, checked hashes, the project editable. Standard library only.
 
-`.venv/ckc_pin-setup` says what .venv was made from, packages on its first line and the native core on its second. It
-reads "unfinished" until everything is installed, so that what an interrupted start leaves behind is never taken as
-good. Where the native core alone has changed, it alone is compiled again.
+    setup_venv.py [--check] [LEVEL]
+
+There are two levels. "demo" has what `./scripts/demo` needs: the project, the tools that compile its native core, and
+the extra `demo`. "test", the default, adds the remaining packages of constraints.txt to it.
+
+`.venv/ckc_pin-setup` says what .venv was made from: packages on its first line, the native core on its second, and its
+level on the third. It reads "unfinished" until the first level is installed, so that what an interrupted start leaves
+behind is never taken as good. An interrupted second level leaves the first one as it was. If the native core alone has
+changed, it alone is compiled again.
 """
 
 import fcntl
 import hashlib
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,10 +26,12 @@ ROOT = Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 STAMP = VENV / "ckc_pin-setup"
 CONSTRAINTS = ROOT / "constraints.txt"
+PYPROJECT = ROOT / "pyproject.toml"
 PACKAGE = ROOT / "ckc_pin"
 NATIVE = PACKAGE / "native" / "src"
 UNFINISHED = "unfinished\n"
-SIZE = "1.5 GB"  # on disk; a quarter of it comes over the network
+LEVELS = ("demo", "test")  # each adds to the one before
+SIZES = {"demo": "1 GB", "test": "3 GB"}  # of .venv on disk; a quarter of it comes over the network
 
 
 class SetupError(Exception):
@@ -29,27 +39,35 @@ class SetupError(Exception):
 
 
 def main() -> None:
-    if "--check" in sys.argv:
-        sys.exit(0 if up_to_date() else 1)
+    arguments = sys.argv[1:]
+    check = "--check" in arguments
+    level = next((argument for argument in arguments if argument != "--check"), LEVELS[-1])
     try:
+        if level not in LEVELS:
+            raise SetupError(f"level {level!r}: expected {' or '.join(LEVELS)}")
+        if check:
+            sys.exit(0 if up_to_date(level) else 1)
         with one_at_a_time() as lock:
-            if not up_to_date():
-                make(lock)
+            if not up_to_date(level):
+                make(level, lock)
     except SetupError as error:
         sys.exit(f"setup: {error}")
     except OSError as error:
-        sys.exit(f"setup: {error}\nsetup: is the folder writable, and is there room for {SIZE}?")
+        sys.exit(f"setup: {error}\nsetup: is the folder writable, and is there room for {SIZES[level]}?")
     except KeyboardInterrupt:
         say("interrupted")
         sys.exit(130)
 
 
-def wanted_stamp() -> str:
-    """Everything that .venv depends on; the place too, since a virtual environment cannot be moved."""
-    packages = digest(f"{sys.version}\n{ROOT}\n", CONSTRAINTS, ROOT / "pyproject.toml", Path(__file__))
+def wanted_stamp() -> tuple[str, str]:
+    """Return digests of what .venv depends on, of packages and of the native core.
+
+    They include the place, since a virtual environment cannot be moved.
+    """
+    packages = digest(f"{sys.version}\n{ROOT}\n", CONSTRAINTS, PYPROJECT, Path(__file__))
     sources = sorted(path for path in NATIVE.rglob("*") if path.is_file())
     native = digest("\n".join(path.relative_to(NATIVE).as_posix() for path in sources), *sources)
-    return f"{packages}\n{native}\n"
+    return packages, native
 
 
 def digest(text: str, *paths: Path) -> str:
@@ -59,11 +77,18 @@ def digest(text: str, *paths: Path) -> str:
     return total.hexdigest()
 
 
-def up_to_date() -> bool:
+def read_stamp() -> tuple[str, str, str] | None:
+    """Return the stamp's digests and level; None without a .venv that is finished."""
     try:
-        return STAMP.read_text() == wanted_stamp() and (VENV / "bin" / "python").exists()
-    except FileNotFoundError:
-        return False
+        packages, native, level = STAMP.read_text().splitlines()
+    except (FileNotFoundError, ValueError):
+        return None
+    return (packages, native, level) if level in LEVELS and (VENV / "bin" / "python").exists() else None
+
+
+def up_to_date(level: str) -> bool:
+    stamp = read_stamp()
+    return stamp is not None and stamp[:2] == wanted_stamp() and LEVELS.index(stamp[2]) >= LEVELS.index(level)
 
 
 @contextmanager
@@ -78,27 +103,86 @@ def one_at_a_time() -> Iterator[int]:
         yield file.fileno()
 
 
-def make(lock: int) -> None:
-    packages = wanted_stamp().splitlines()[0]
-    if not (STAMP.exists() and STAMP.read_text().startswith(packages)):
+def make(level: str, lock: int) -> None:
+    packages, native = wanted_stamp()
+    stamp = read_stamp()
+    if stamp is None or stamp[0] != packages:
         clear_away()
-        say(f"making .venv with Python {sys.version.split()[0]}: once only, a minute or more, {SIZE}")
+        base = LEVELS[0]
+        say(f"making .venv with Python {sys.version.split()[0]}: once only, a minute or more, {SIZES[level]}")
         VENV.mkdir()
         STAMP.write_text(UNFINISHED)
         with removed_on_failure():
             run_quietly(lock, "venv", [sys.executable, "-I", "-m", "venv", str(VENV)])
-            # Wheels only: building a source package would fetch a build backend whose hash nobody checks.
-            hashed = ["--require-hashes", "--only-binary=:all:", "--progress-bar=off", "-r", str(CONSTRAINTS)]
-            run_with_progress(lock, "pip", [*pip(), *hashed])
-    STAMP.write_text(UNFINISHED)
-    say("installing ckc_pin: its native core is compiled, two minutes or more")
-    with removed_on_failure():
-        editable = ["--no-deps", "--no-build-isolation", "--no-index", "--editable", str(ROOT)]
-        run_quietly(lock, "pip", [*pip(), *editable])
-        # The first start compiles nothing, and neither do later ones where Python is told to write no bytecode.
-        run_quietly(lock, "compileall", [str(VENV / "bin" / "python"), "-I", "-m", "compileall", "-q", str(PACKAGE)])
-        STAMP.write_text(wanted_stamp())
+            install(base, lock)
+            compile_native(lock)
+    else:
+        base = stamp[2]
+        if stamp[1] != native:
+            STAMP.write_text(UNFINISHED)
+            with removed_on_failure():
+                compile_native(lock)
+    STAMP.write_text(f"{packages}\n{native}\n{base}\n")
+    for added in LEVELS[LEVELS.index(base) + 1 : LEVELS.index(level) + 1]:
+        say(f"adding what level {added!r} needs: once only, a minute or more, {SIZES[added]} in all")
+        # An interrupted start may have left some of these packages behind, whole or not: install them again.
+        install(added, lock, "--no-deps", "--ignore-installed")
+        STAMP.write_text(f"{packages}\n{native}\n{added}\n")
     say("done")
+
+
+def install(level: str, lock: int, *options: str) -> None:
+    """Install the packages that a level adds."""
+    entries = locked_packages(level)
+    file = VENV / f"ckc_pin-{level}.txt"
+    file.write_text("".join(entries.values()))
+    # Wheels only: building a source package would fetch a build backend whose hash nobody checks.
+    hashed = ["--require-hashes", "--only-binary=:all:", "--progress-bar=off", "-r", str(file)]
+    run_with_progress(lock, "pip", [*pip(), *options, *hashed], total=len(entries))
+
+
+def locked_packages(level: str) -> dict[str, str]:
+    """Return the entries of constraints.txt that a level adds, by name of the package."""
+    entries = {}
+    dependencies: dict[str, set[str]] = {}
+    for entry in re.findall(r"^[a-z0-9][^ ]*==.*\n(?: .*\n)*", CONSTRAINTS.read_text(), re.MULTILINE):
+        name = package_name(entry)
+        entries[name] = entry
+        # After its hashes, an entry lists the packages that need it: "# via NAME", or "# via" with one NAME a line.
+        for dependent in re.findall(r"^ +# +(?:via +)?(?!via$)(\S+)$", entry, re.MULTILINE):
+            dependencies.setdefault(dependent, set()).add(name)
+    needed: set[str] = set()
+    queue = [package_name(requirement) for requirement in demo_requirements()]
+    while queue:
+        name = queue.pop()
+        if name not in needed:
+            needed.add(name)
+            queue += dependencies.get(name, ())
+    if missing := needed - entries.keys():
+        raise SetupError(f"{CONSTRAINTS}: {', '.join(sorted(missing))} of {PYPROJECT} missing: run ./scripts/lock")
+    return {name: entry for name, entry in entries.items() if (name in needed) == (level == "demo")}
+
+
+def demo_requirements() -> list[str]:
+    """Return what pyproject.toml requires to build the project and to run the demo."""
+    content = tomllib.loads(PYPROJECT.read_text())
+    project = content["project"]
+    extra: list[str] = project["optional-dependencies"]["demo"]
+    return [*project["dependencies"], *content["build-system"]["requires"], *extra]
+
+
+def package_name(requirement: str) -> str:
+    """Return the normalized name of the package that a requirement names."""
+    name = re.split(r"[^A-Za-z0-9._-]", requirement, maxsplit=1)[0]
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def compile_native(lock: int) -> None:
+    say("installing ckc_pin: its native core is compiled, a minute or more")
+    editable = ["--no-deps", "--no-build-isolation", "--no-index", "--editable", str(ROOT)]
+    run_quietly(lock, "pip", [*pip(), *editable])
+    # The first start compiles nothing, and neither do later ones where Python is told to write no bytecode.
+    run_quietly(lock, "compileall", [str(VENV / "bin" / "python"), "-I", "-m", "compileall", "-q", str(PACKAGE)])
 
 
 def pip() -> list[str]:
@@ -135,9 +219,8 @@ def remove_venv() -> None:
     shutil.rmtree(VENV)
 
 
-def run_with_progress(lock: int, what: str, command: list[str]) -> None:
-    """Run pip; on a terminal tell which package it is at."""
-    total = sum("==" in line for line in CONSTRAINTS.read_text().splitlines() if not line.startswith("#"))
+def run_with_progress(lock: int, what: str, command: list[str], total: int) -> None:
+    """Run pip; on a terminal tell which of its `total` packages it is at."""
     at = 0
 
     def progress(line: str) -> None:
@@ -180,8 +263,10 @@ def run_quietly(lock: int, what: str, command: list[str], on_line: Callable[[str
     if process.returncode != 0:
         chatter = ("Collecting ", "Downloading ", "Using cached ", "Ignoring ")
         heard = [f"    {line}" for line in lines if not line.lstrip().startswith(chatter)][-12:]
-        remedy = f"setup: it needs the network and {SIZE} of disk; when the cause is gone, start again."
-        raise SetupError("\n".join([f"{what} failed, .venv is not made:", *heard, remedy]))
+        stamp = read_stamp()
+        result = f".venv stays at level {stamp[2]!r}" if stamp else ".venv is not made"
+        remedy = f"setup: it needs the network and {SIZES[LEVELS[-1]]} of disk; when the cause is gone, start again."
+        raise SetupError("\n".join([f"{what} failed, {result}:", *heard, remedy]))
 
 
 def say(text: str) -> None:
