@@ -18,7 +18,8 @@ def test_every_source_file_is_in_a_room() -> None:
 
 
 def test_every_source_file_is_compiled() -> None:
-    listed = re.findall(r"\b[a-z_]+/[a-z_]+\.cpp\b", (SOURCES / "CMakeLists.txt").read_text())
+    text = (SOURCES / "CMakeLists.txt").read_text()
+    listed = re.findall(r"\b[a-z_]+/[a-z_]+\.cpp\b", text.partition("nanobind_add_module")[2].partition(")")[0])
     assert sorted(listed) == [file for file in FILES if file.endswith(".cpp")]
 
 
