@@ -17,6 +17,7 @@ import numpy as np
 from ckc_pin.base.interrupt import acknowledge, interrupt_again, uninterrupted_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Summary
+from ckc_pin.base.toml_writer import to_toml_value
 from ckc_pin.base.validation import describe_value, require_flag, require_path, require_table, require_type
 from ckc_pin.ensembles.members import DONE, STOPPED, Chunk, Members, SweepTask
 from ckc_pin.ensembles.outputs import Function
@@ -26,7 +27,7 @@ from ckc_pin.ensembles.store import RESULTS, RESUME_HINT, Store, require_librari
 from ckc_pin.ensembles.store_layout import array_name
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, to_toml_value
+from ckc_pin.scene.scene import EXPECTED_OVERRIDES
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,8 +170,8 @@ def ensemble(
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
         "scene": str(scene), "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
-        "variables": {name: _to_data(x) for name, x in variables.items()},
-        "outputs": {name: _to_data(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
+        "variables": {name: to_toml_value(x) for name, x in variables.items()},
+        "outputs": {name: to_toml_value(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
     if members is not None:
         data["members"] = to_toml_value(members)
@@ -213,10 +214,6 @@ def _require_resources(out: Any, threads: Any, workers: Any, scheduler: Any, chu
             raise InputError(f"ensemble: {name}: expected a whole number of at least 1, got {describe_value(count)}")
     if scheduler and workers:
         raise InputError("ensemble: workers and scheduler: give one of them")
-
-
-def _to_data(value: Any) -> Any:
-    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else to_toml_value(value)
 
 
 # --- sweeps ----------------------------------------------------------------------------------------

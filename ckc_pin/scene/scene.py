@@ -17,6 +17,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.toml import convert, find_faults, join_dotted_keys, read_text, read_toml
+from ckc_pin.base.toml_writer import to_toml_value
 from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_table, require_type, suggest_name
 from ckc_pin.control.spec import ControllerSpec, FeedbackSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import InputError
@@ -43,7 +44,6 @@ __all__ = [
     "list_catalogue",
     "list_scene_names",
     "load_scene",
-    "to_toml_value",
 ]
 
 SUFFIX = ".scene.toml"
@@ -407,15 +407,6 @@ def _split_key(key: str) -> list[str]:
         if key.startswith(start):
             return [*path, key.removeprefix(start)]
     return key.split(".")
-
-
-def to_toml_value(value: Any) -> Any:
-    """Return a Python value in the types that TOML has: NumPy scalars and arrays become numbers and lists."""
-    if isinstance(value, Mapping):
-        return {key: to_toml_value(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_toml_value(inner) for inner in value]
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def _drop_absent(value: Any) -> Any:
