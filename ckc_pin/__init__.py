@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from ckc_pin.linear.locus import GainLocus, gain_locus
     from ckc_pin.linear.stability_result import Stability
     from ckc_pin.mechanism import Mechanism
+    from ckc_pin.mechanism.spec import Loop
     from ckc_pin.run.events import Event
     from ckc_pin.run.inverse import inverse_dynamics
     from ckc_pin.run.ivp import as_ivp
@@ -73,6 +74,7 @@ __all__ = [
     "GainLocus",
     "InputError",
     "LinearModel",
+    "Loop",
     "Mechanism",
     "MechanismError",
     "MotionForces",
@@ -118,6 +120,7 @@ MODULES = {
     "GainLocus": "linear.locus",
     "InputError": "errors",
     "LinearModel": "linear.linear_model",
+    "Loop": "mechanism.spec",
     "Mechanism": "mechanism",
     "MechanismError": "errors",
     "MotionForces": "run.motion_forces",
