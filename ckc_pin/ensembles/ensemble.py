@@ -27,7 +27,8 @@ from ckc_pin.ensembles.store import RESULTS, RESUME_HINT, Store, require_librari
 from ckc_pin.ensembles.store_layout import array_name
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES
+from ckc_pin.scene.scene import EXPECTED_SCENE, Scene
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -97,7 +98,7 @@ class SweepResult(HasSummary):
 
 
 def ensemble(
-    scene: str | Path,
+    scene: Scene | str | Path,
     variables: Mapping[str, Any],
     outputs: Mapping[str, str | Mapping[str, Any] | Function],
     *,
@@ -115,8 +116,8 @@ def ensemble(
 
     Parameters
     ----------
-    scene : str or Path
-        A scene's shipped name, or its path.
+    scene : Scene, str or Path
+        A scene, its shipped name, or its path. Its controller is described by a table, not by an object of Python.
     variables : mapping
         Distribution of each variable, by the name of a parameter or a key of the scene. ``{"uniform": [a, b]}``,
         "loguniform", "sobol" or "lhs" from a to b; ``{"normal": [mean, deviation]}``, or "lognormal" with those of the
@@ -169,7 +170,8 @@ def ensemble(
     require_libraries()
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
-        "scene": str(scene), "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
+        "scene": scene.name if isinstance(scene, Scene) else str(scene),
+        "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
         "variables": {name: to_toml_value(x) for name, x in variables.items()},
         "outputs": {name: to_toml_value(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
@@ -195,7 +197,12 @@ def ensemble(
 
 def _require_tables(scene: Any, variables: Any, outputs: Any, overrides: Any) -> None:
     """Refuse arguments of wrong type that describe the sweep (InputError); their content is checked later."""
-    require_type(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
+    require_type(scene, (Scene, str, Path), "ensemble: scene", EXPECTED_SCENE)
+    if isinstance(scene, Scene) and (scene.controller is not None or scene.events):
+        raise InputError(
+            "ensemble: scene: a controller or event that is an object of Python is not supported, because members run "
+            'in native threads and other processes; give a table, as controller={"type": "set_point", ...}'
+        )
     require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
     require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
     if overrides is not None:
@@ -361,7 +368,7 @@ def save_worst_members(
         values = np.array([float(results[array_name(variable)][k]) for variable in members.names])
         folder = out / f"worst_{array_name(name)}_{k}"
         try:
-            run = simulate(members.scene_name, members.overrides_of(values))
+            run = simulate(members.scene_of(values))
         except CkcError:
             continue
         if run.status == "interrupted":

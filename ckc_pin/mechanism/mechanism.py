@@ -312,6 +312,29 @@ class Mechanism(HasSummary):
                 raise InputError(f"{what}: {dependent!r} follows from the loops; there are {', '.join(names)}")
         return self.tree.vector(values, names, what, fill)
 
+    def name_values(self, values: Sequence[Any], what: str, *choices: Sequence[str]) -> dict[str, Any]:
+        """Return values by name, as a table of a file has them.
+
+        Parameters
+        ----------
+        values : sequence
+            In the order of the names.
+        what : str
+            What the values are, for messages.
+        *choices : sequence of str
+            The names; the first of several choices with as many names as there are values.
+
+        Raises
+        ------
+        InputError
+            There are more or fewer values than names.
+        """
+        names = next((names for names in choices if len(names) == len(values)), None)
+        if names is None:
+            orders = " or ".join(f"{len(names)}, in the order {', '.join(names) or 'none'}" for names in choices)
+            raise InputError(f"{what}: got {len(values)} values; expected {orders}, or a table by name")
+        return dict(zip(names, values, strict=True))
+
     def refuse_prescribed_joints(self, function: str) -> None:
         """Raise InputError if joints are prescribed, for a function that does not support them."""
         if self.prescribed:

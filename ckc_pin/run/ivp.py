@@ -28,7 +28,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
     dae_acceleration,
@@ -44,7 +44,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.control import apply_u
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import build_scene_actuation, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["Dae", "Force", "Ivp", "LevelSet", "PrintedSpf", "as_ivp", "make_force"]
@@ -107,7 +107,8 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
     """
     scene = as_scene(scene, overrides, "as_ivp")
     spec, mechanism = scene.spec, load_scene_mechanism(scene)
-    if isinstance(spec.controller, FeedbackSpec) and spec.controller.sample_time is not None:
+    law = build_scene_controller(scene, mechanism)
+    if isinstance(apply_sampling(scene, law), Sampled):
         raise InputError("as_ivp: controller.sample_time: a sampled u is not a function of t and y; remove sample_time")
     smoothing = spec.friction_smoothing
     if mechanism.joints.has_events(smoothing):
@@ -116,7 +117,7 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
             "without stops set friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    force = make_force(build_scene_controller(scene, mechanism), build_scene_actuation(scene, mechanism))
+    force = make_force(law, build_scene_actuation(scene, mechanism))
     if smoothing is not None:
         force = _with_friction(force, mechanism, smoothing)
     span = (0.0, spec.t_end)

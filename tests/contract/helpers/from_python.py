@@ -12,10 +12,10 @@ LISTS = {"loop": "loops", "coupling": "couplings", "spring": "springs", "force":
          "motor": "motors", "point": "points", "tree": "trees"}  # fmt: skip
 
 
-def mechanism_arguments(name: str) -> dict[str, Any]:
+def mechanism_arguments(name: str, file: str = "mechanism.toml") -> dict[str, Any]:
     """Return the arguments of `Mechanism.from_urdf` for a shipped mechanism, with its URDF as text."""
     folder = library() / name
-    data = tomllib.loads((folder / "mechanism.toml").read_text())
+    data = tomllib.loads((folder / file).read_text())
     if "urdf" in data:
         data["urdf"] = (folder / data["urdf"]).read_text()
     for tree in data.get("tree", []):
@@ -24,5 +24,5 @@ def mechanism_arguments(name: str) -> dict[str, Any]:
     return {LISTS.get(key, key): value for key, value in data.items()}
 
 
-def mechanism_from_python(name: str) -> Mechanism:
-    return Mechanism.from_urdf(**mechanism_arguments(name))
+def mechanism_from_python(name: str, file: str = "mechanism.toml") -> Mechanism:
+    return Mechanism.from_urdf(**mechanism_arguments(name, file))
