@@ -146,7 +146,7 @@ def _scene_of(run: Run, overrides: Mapping[str, Any]) -> Scene:
     if any(key.partition(".")[0] == "mechanism" for key in overrides):
         raise InputError("mechanism: a run belongs to its mechanism; give a scene to use another mechanism")
     sources = Sources(run.scene_name, None, run.texts)
-    return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources)
+    return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources, sources)
 
 
 def _collect_motion(

@@ -28,6 +28,7 @@ from ckc_pin import (
     load_scene,
     simulate,
 )
+from ckc_pin.analysis.map.desired_path import read_desired
 from ckc_pin.mechanism.library import GENERATORS, library
 from ckc_pin.scene.names import list_catalogue
 from tests.conftest import assert_close
@@ -124,6 +125,32 @@ def test_run_from_python_is_saved_and_replayed(five_bar: Mechanism, tmp_path: Pa
     np.testing.assert_array_equal(ckc_pin.inverse_dynamics(again).tau, ckc_pin.inverse_dynamics(run).tau)
     followed = simulate(five_bar, t_end=0.2, initial=START, controller=TRACKING)
     np.testing.assert_array_equal(Run.load(followed.save(tmp_path / "run.npz")).desired, followed.desired)
+
+
+def test_run_takes_arrays_in_overrides_of_its_scene(five_bar: Mechanism, tmp_path: Path) -> None:
+    run = simulate(five_bar, t_end=0.05, initial=START, controller=SET_POINT)
+    again = Run.load(run.save(tmp_path / "run.npz"))
+    for what in (run, again):
+        limited = ckc_pin.inverse_dynamics(what, {"controller.torque_limit": [0.5, 100.0]})
+        assert [(x["motor"], x["limit"]) for x in limited.exceeded] == [("theta_1", 0.5)]
+
+
+@pytest.mark.parametrize("name", ["n_four_bar", "five_bar"])
+def test_scene_takes_names_of_mechanisms(name: str, tmp_path: Path) -> None:
+    scene = Scene(name, t_end=0.02)
+    assert_same_runs(simulate(scene), simulate(scene.save(tmp_path)))
+    assert simulate(scene).mechanism.sources.folder == load(name).sources.folder
+    with pytest.raises(InputError, match="'five_bar/swing' is a scene; its mechanism is 'five_bar'"):
+        Scene("five_bar/swing", t_end=1.0)
+
+
+def test_mechanisms_from_python_use_the_compiled_terms_of_their_files(
+    five_bar: Mechanism, compiled_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(compiled_cache))
+    run = simulate(five_bar, t_end=0.05, initial=START)
+    assert run.stats["terms"] == "generated"
+    assert_same_runs(run, simulate(load("five_bar"), t_end=0.05, initial=START))
 
 
 def test_parameters_of_the_mechanism_are_those_of_the_scene(tmp_path: Path) -> None:
@@ -389,7 +416,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "simulator": lambda scene: Simulator(scene).step(np.array([1.0, 0.5]), 0.01).v_tree,
     "controller": lambda scene: (lambda s: s.controller.u(0.0, s.state.terms))(Simulator(scene)),
     "sensitivities": lambda scene: ckc_pin.sensitivities(scene, ["initial.q.theta_1", "controller.K_D.theta_1"]).q_tree,
-    "map": lambda scene: ckc_pin.singularity_map(load("five_bar"), scene=scene, cells=16).path.t,  # type: ignore[union-attr]
+    "map": lambda scene: np.array(read_desired(scene, load("five_bar")).desired(0.05)),
 }
 
 
