@@ -407,6 +407,13 @@ def test_overrides_keep_objects_and_replace_them(five_bar: Mechanism) -> None:
 
 # --- every function that takes a scene -----------------------------------------------------------
 
+
+def read_desired_at(scene: Scene | Path, t: float) -> Any:
+    """Return the desired motion that a singularity map draws, at a time (s)."""
+    loaded = scene if isinstance(scene, Scene) else load_scene(scene)
+    return np.array(read_desired(loaded, load("five_bar")).desired(t))
+
+
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "check": lambda scene: ckc_pin.check(scene).desired.until,  # type: ignore[union-attr]
     "linearize": lambda scene: ckc_pin.linearize(scene, 0.05).closed_loop,
@@ -416,7 +423,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "simulator": lambda scene: Simulator(scene).step(np.array([1.0, 0.5]), 0.01).v_tree,
     "controller": lambda scene: (lambda s: s.controller.u(0.0, s.state.terms))(Simulator(scene)),
     "sensitivities": lambda scene: ckc_pin.sensitivities(scene, ["initial.q.theta_1", "controller.K_D.theta_1"]).q_tree,
-    "map": lambda scene: np.array(read_desired(scene, load("five_bar")).desired(0.05)),
+    "map": lambda scene: read_desired_at(scene, 0.05),
 }
 
 
