@@ -88,6 +88,8 @@ def simulate(
     """
     if overrides is not None:
         require_table(overrides, "simulate: overrides", EXPECTED_OVERRIDES)
+        if twice := sorted(set(keys) & set(overrides)):
+            raise InputError(f"simulate: {twice[0]} is given twice, as an argument and in overrides")
     if isinstance(scene, Mechanism):
         scene = _make_scene(scene, overrides or {}, controller, events, keys)
     else:

@@ -43,7 +43,7 @@ from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
 
 __all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "describe_formulation", "load_scene", "make_scene"]
 
-EXPECTED_SCENE = 'a scene: its shipped name, as "five_bar/swing", its path, or what load_scene returns'
+EXPECTED_SCENE = 'a scene: a Scene, its shipped name, as "five_bar/swing", or its path'
 DEFAULT_OUTPUT_INTERVALS = 500  # where a scene gives no output_dt
 MAX_OUTPUT_INSTANTS = 1_000_000
 
@@ -158,8 +158,7 @@ class Scene(HasSummary):
         data = apply_overrides(self.to_dict(), overrides)
         is_other_mechanism = any(key.partition(".")[0] == "mechanism" for key in overrides)
         scene = make_scene(data, self.name, self.sources, None if is_other_mechanism else self.mechanism_sources)
-        scene.__dict__.update(events=self.events, controller=None if "controller" in overrides else self.controller)
-        return scene
+        return _create(scene, events=self.events, controller=None if "controller" in overrides else self.controller)
 
     def with_control(self, controller: Any, events: Sequence[Any]) -> Scene:
         """Return the scene with another controller, and with further events.
@@ -184,15 +183,16 @@ class Scene(HasSummary):
         if isinstance(controller, Mapping | msgspec.Struct):
             table, texts = to_toml_value(controller), dict(self.sources.available)
             embed_files(table, texts, reads_paths=self.sources.folder is None)
-            overrides["controller"], scene = table, replace_attributes(self, sources=self.sources.with_texts(texts))
+            overrides["controller"], scene = table, _create(self, sources=self.sources.with_texts(texts))
         elif controller is not None:
-            scene = replace_attributes(self, controller=as_sampled_or_controller(controller))
+            law = controller if isinstance(controller, Sampled) else as_controller(controller)
+            scene = _create(self, controller=law)
         tables = [to_toml_value(event) for event in events if isinstance(event, Mapping | msgspec.Struct)]
         if tables:
             convert(tables, list[EventSpec], source, "events")
             overrides["event"] = [*scene.to_dict()["event"], *tables]
         functions = tuple(event for event in events if not isinstance(event, Mapping | msgspec.Struct))
-        return replace_attributes(scene.with_overrides(overrides), events=(*self.events, *functions))
+        return _create(scene.with_overrides(overrides), events=(*self.events, *functions))
 
     def save(self, folder: str | Path, name: str = DEFAULT, *, overwrite: bool = False) -> Path:
         """Write the scene and all its files into a folder, so that ``ckc run`` does the same.
@@ -385,18 +385,6 @@ def as_scene(scene: Any, overrides: Mapping[str, Any] | None, caller: str) -> Sc
     return scene.with_overrides(overrides) if isinstance(scene, Scene) else load_scene(scene, overrides)
 
 
-def replace_attributes(scene: Scene, **attributes: Any) -> Scene:
-    """Return a copy of a scene with other attributes."""
-    copy = object.__new__(Scene)
-    copy.__dict__.update({**{field.name: getattr(scene, field.name) for field in fields(Scene)}, **attributes})
-    return copy
-
-
-def as_sampled_or_controller(controller: Any) -> Controller | TorqueController | Sampled:
-    """Return a caller's controller: a `Sampled` as it is, or what `as_controller` returns (InputError)."""
-    return controller if isinstance(controller, Sampled) else as_controller(controller)
-
-
 def make_scene(data: dict[str, Any], name: str, sources: Sources, plant_sources: Sources | None = None) -> Scene:
     """Return a scene of parsed data, checked for types by msgspec and then for keys that exclude or need each other.
 
@@ -422,7 +410,7 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources, plant_sources:
     def load() -> Mechanism:
         part = {key: data[key] for key in ("mechanism", "parameters", "prescribed") if key in data}
         spec = convert({**part, "formulation": "dae", "t_end": 1.0}, SceneSpec, sources.name)
-        return load_scene_mechanism(_create(spec, name, sources, plant_sources))
+        return load_scene_mechanism(_create(spec=spec, name=name, sources=sources, mechanism_sources=plant_sources))
 
     join_names(data)
     if isinstance(data.get("controller"), dict):
@@ -454,15 +442,16 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources, plant_sources:
     min_step, max_step = spec.solver.min_step, spec.solver.max_step
     if max_step is not None and min_step > max_step:
         raise InputError(f"{sources.name}: solver: min_step = {min_step:g} is above max_step = {max_step:g}")
-    return _create(spec, name, sources, plant_sources)
+    return _create(spec=spec, name=name, sources=sources, mechanism_sources=plant_sources)
 
 
-def _create(spec: SceneSpec, name: str, sources: Sources, plant_sources: Sources | None) -> Scene:
-    scene = object.__new__(Scene)
-    scene.__dict__.update(
-        spec=spec, name=name, sources=sources, mechanism_sources=plant_sources, controller=None, events=()
-    )
-    return scene
+def _create(scene: Scene | None = None, **attributes: Any) -> Scene:
+    """Return a scene with these attributes. The others are those of `scene`, or absent."""
+    names = [field.name for field in fields(Scene)]  # without cached properties
+    defaults = {"controller": None, "events": ()} if scene is None else {name: getattr(scene, name) for name in names}
+    new = object.__new__(Scene)
+    new.__dict__.update({**defaults, **attributes})
+    return new
 
 
 def _check_event(event: EventSpec, where: str) -> None:

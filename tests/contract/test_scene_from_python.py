@@ -285,6 +285,7 @@ TORQUES = {"type": "torques"}
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "no end": ({}, "simulate: a Mechanism has no end time; give t_end"),
     "misspelled end": ({"t_ends": 1.0}, "give t_end, .*, not t_ends"),
+    "given twice": ({"t_end": 1, "overrides": {"t_end": 2}}, "simulate: t_end is given twice, as an argument and in"),
     "unknown key": ({"t_end": 1, "solvr": {}}, "Scene: unknown key 'solvr'; .*did you mean 'solver'"),
     "unknown key of a table": ({"t_end": 1, "solver": {"rtl": 1}}, "Scene: solver: unknown key 'rtl'.*mean 'rtol'"),
     "unknown key of a controller": (
