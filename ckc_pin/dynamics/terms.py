@@ -18,7 +18,7 @@ from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.linear_algebra import Factorization
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.toml_writer import to_toml_value
-from ckc_pin.base.validation import require_table
+from ckc_pin.base.validation import is_array, require_table
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma
@@ -235,7 +235,7 @@ def terms(
 
 def _as_table(mechanism: Mechanism, values: Any, where: str) -> Mapping[str, float]:
     """Return values by coordinate; an array is in the order of `independent` or `coordinates` (InputError)."""
-    if isinstance(values, list | tuple | np.ndarray):
+    if is_array(values):
         return mechanism.name_values(to_toml_value(values), where, mechanism.independent, mechanism.coordinates)
     expected = f"a table by coordinate, as {{{mechanism.coordinates[0]!r}: 0.4}}, or an array"
     require_table(values, where, expected)

@@ -13,7 +13,8 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import is_number, require_table, require_type
+from ckc_pin.base.toml_writer import to_toml_value
+from ckc_pin.base.validation import is_array, is_number, require_table, require_type
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking
@@ -132,9 +133,9 @@ def linearize(
         subject = _find_subject(what, at, overrides)
         if subject.mechanism.d == 0:
             raise InputError(f"{subject.mechanism.name}: d = 0, the mechanism has no freedom to linearize")
-        if isinstance(at, list | tuple | np.ndarray):
+        if is_array(at):
             mechanism = subject.mechanism
-            at = mechanism.name_values(list(at), "linearize: at", mechanism.independent, mechanism.coordinates)
+            at = mechanism.name_values(to_toml_value(at), "linearize: at", mechanism.independent, mechanism.coordinates)
         if isinstance(at, Mapping):
             return _linearize_at_coordinates(subject, at)
         if not isinstance(at, str):
@@ -152,7 +153,7 @@ def linearize(
 
 def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
     if isinstance(what, str | Path):
-        needs_run = not isinstance(at, Mapping | str | list | tuple | np.ndarray)
+        needs_run = not (isinstance(at, Mapping | str) or is_array(at))
         if not (is_scene_name(str(what)) or overrides or needs_run):
             return _Subject(load(what), None)
         what = load_scene(what, overrides)
@@ -175,7 +176,8 @@ def _require_time(at: Any) -> float:
 
 def _unknown_state(at: Any) -> InputError:
     return InputError(
-        f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or a table of coordinates'
+        f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or coordinates as a table or '
+        "an array"
     )
 
 

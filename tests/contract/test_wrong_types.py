@@ -162,6 +162,8 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "check": (lambda: ckc_pin.check(run()), "check: what: expected a mechanism or a scene.*, got a Run"),
     "terms of a scene": (lambda: ckc_pin.terms(load_scene(SWING), Q), "terms: mechanism: expected .*, got a Scene"),
     "terms at an array": (lambda: ckc_pin.terms("five_bar", np.zeros(3)), "terms: q: got 3 values; expected 2, in the"),
+    "terms at a scalar": (lambda: ckc_pin.terms("five_bar", np.array(3.0)), "or an array, got a ndarray"),
+    "terms at a matrix": (lambda: ckc_pin.terms("five_bar", np.eye(2)), "theta_1 = .1.0, 0.0.: expected a number"),
     "terms at a number": (lambda: ckc_pin.terms("five_bar", 3.0), "q: expected a table by coo.*, or an array, got 3.0"),
     "terms at a word": (lambda: ckc_pin.terms("five_bar", {**Q, "theta_1": "a"}), "theta_1 = 'a': expected a number"),
     "play nothing": (ckc_pin.play, "play: no run given"),
