@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from ckc_pin.linear.locus import GainLocus, gain_locus
     from ckc_pin.linear.stability_result import Stability
     from ckc_pin.mechanism import Mechanism
+    from ckc_pin.mechanism.spec import Loop
     from ckc_pin.run.events import Event
     from ckc_pin.run.inverse import inverse_dynamics
     from ckc_pin.run.ivp import as_ivp
@@ -77,6 +78,7 @@ __all__ = [
     "InputError",
     "JointServo",
     "LinearModel",
+    "Loop",
     "Mechanism",
     "MechanismError",
     "MotionForces",
@@ -124,6 +126,7 @@ MODULES = {
     "InputError": "errors",
     "JointServo": "control.joint_servo",
     "LinearModel": "linear.linear_model",
+    "Loop": "mechanism.spec",
     "Mechanism": "mechanism",
     "MechanismError": "errors",
     "MotionForces": "run.motion_forces",

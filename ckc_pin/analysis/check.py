@@ -23,6 +23,7 @@ from ckc_pin.control.workspace import DesiredCheck
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import assembly_branches
+from ckc_pin.linear.closed_loop import LAWS
 from ckc_pin.linear.stability import stability
 from ckc_pin.linear.stability_result import Stability
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -30,8 +31,10 @@ from ckc_pin.mechanism.warnings import compute_moving_mass, describe_joints
 from ckc_pin.run.checks import check_desired, desired_warnings, limit_warnings, require_runnable, start_warnings
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import Start
+from ckc_pin.scene.names import is_scene_name
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES
 from ckc_pin.scene.parts import apply_sampling, build_scene_actuation, build_scene_controller, load_scene_mechanism
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, is_scene_name, load_scene, make_scene
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["Check", "check"]
 
@@ -163,7 +166,7 @@ def check(
     what : Mechanism, Scene, str or Path
         "five_bar" is a mechanism, "five_bar/tracking" and "x.scene.toml" are scenes.
     overrides : mapping, optional
-        With a name or path: values by dotted key, for a scene as in `load_scene`, for a mechanism as in `load`.
+        Values by dotted key, for a scene as in `load_scene`, for a mechanism's name or path as in `load`.
     branches : bool
         List the assembly branches, too. Small mechanisms only.
 
@@ -183,8 +186,10 @@ def check(
         require_table(overrides, "check: overrides", EXPECTED_OVERRIDES)
     if isinstance(what, str | Path):
         what = load_scene(what, overrides) if is_scene_name(str(what)) else load(what, overrides)
+    elif isinstance(what, Scene):
+        what = what.with_overrides(overrides)
     elif overrides:
-        raise InputError(f"check: overrides: expected none with a {type(what).__name__}; give its name or path instead")
+        raise InputError("check: overrides: expected none with a Mechanism; give its name or path instead")
     if isinstance(what, Mechanism):
         mechanism = what
         warnings = limit_warnings(mechanism, mechanism.q_tree, "the assembled configuration")
@@ -244,11 +249,11 @@ def _check_scene(scene: Scene, mechanism: Mechanism) -> Check:
     warnings = [] if start is None else start_warnings(scene, mechanism, start)
     warnings += desired_warnings(mechanism, desired, spec.t_end)
     if mechanism.prescribed and mechanism.d == 0 and start is not None:  # the motion does not depend on any force
-        run = simulate(make_scene({**scene.to_dict(), "formulation": "reduced"}, scene.name, scene.sources))
+        run = simulate(scene, {"formulation": "reduced"})
         if run.status == "stopped":
             warnings.append(f"the prescribed motion cannot be followed beyond t = {run.t[-1]:.5g} s: {run.message}")
     closed_loop = None
-    if isinstance(controller, SetPoint | Tracking):
+    if isinstance(controller, SetPoint | Tracking) and type(controller) in LAWS:
         closed_loop = _check_stability(scene, controller, actuation, start, desired, error_message)
     if closed_loop is None:
         warnings += [error_message] if error_message else []

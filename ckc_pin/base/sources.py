@@ -27,22 +27,32 @@ MAX_XML_DEPTH = 300  # nested elements; ElementTree writes by recursion
 
 
 class Sources:
-    """Texts of the files that a mechanism file names. Each text is kept, so that a run can store it.
+    """Texts of the files that a mechanism or scene names. Each text that was used is kept, so that a run can store it.
 
     Parameters
     ----------
     name : str
-        Name of the mechanism file, for messages.
+        Name of the file that names the others, for messages.
     folder : Path or None
-        Folder that relative names refer to. None: `texts` is complete.
+        Folder that relative names refer to. None: there are no other texts than `texts`.
     texts : mapping, optional
-        Texts by file name.
+        Texts by file name, which are taken instead of files.
+
+    Attributes
+    ----------
+    texts, available : dict of str to str
+        The texts that were used, and those that were given, by file name.
     """
 
     def __init__(self, name: str, folder: Path | None, texts: Mapping[str, str] | None = None) -> None:
         self.name = name
         self.folder = folder
-        self.texts = dict(texts or {})
+        self.texts: dict[str, str] = {}
+        self.available = dict(texts or {})
+
+    def with_texts(self, texts: Mapping[str, str]) -> Sources:
+        """Return sources with further texts, none of which was used yet."""
+        return Sources(self.name, self.folder, {**self.available, **self.texts, **texts})
 
     @contextmanager
     def prefix_errors(self) -> Iterator[None]:
@@ -63,9 +73,12 @@ class Sources:
             The file or package does not exist.
         """
         if file not in self.texts:
-            if self.folder is None:
+            if file in self.available:
+                self.texts[file] = self.available[file]
+            elif self.folder is None:
                 raise InputError(f"{self.name}: it does not contain the text of {file!r}")
-            self.texts[file] = read_text(resolve_path(file, self.folder, self.name), "file")
+            else:
+                self.texts[file] = read_text(resolve_path(file, self.folder, self.name), "file")
         return self.texts[file]
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "describe_value",
     "find_near_names",
     "find_nearest_name",
+    "is_array",
     "is_number",
     "require_callable",
     "require_controller_signature",
@@ -127,6 +128,11 @@ def require_callable(value: Any, where: str, expected: str, count: int = 2) -> N
 def require_flag(value: Any, where: str) -> None:
     """Require True or False. Raises as `require_type` does."""
     require_type(value, (bool, np.bool_), where, "True or False")
+
+
+def is_array(value: Any) -> bool:
+    """Whether a value is a list, a tuple or an array with at least one axis."""
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
 
 
 def is_number(value: Any) -> bool:

@@ -33,7 +33,7 @@ __all__ = ["check", "compile_", "keys", "list_", "terms"]
 @options.as_json
 def list_(as_json: bool) -> None:
     """List shipped mechanisms and scenes."""
-    from ckc_pin.scene.scene import list_catalogue
+    from ckc_pin.scene.names import list_catalogue
 
     entries = list_catalogue()
     if as_json:

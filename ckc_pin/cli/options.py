@@ -61,7 +61,7 @@ def complete_mechanisms(context: click.Context, parameter: click.Parameter, inco
 def complete_scenes(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Complete the name of a shipped mechanism or scene, or a path."""
     from ckc_pin.mechanism.library import shipped
-    from ckc_pin.scene.scene import list_scene_names
+    from ckc_pin.scene.names import list_scene_names
 
     names = []
     for mechanism_name in shipped():

@@ -10,6 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import pivoted_columns
+from ckc_pin.base.validation import is_number, suggest_name
 from ckc_pin.control.spec import AllocationSpec, Limit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -26,18 +27,33 @@ DRIVE_TOLERANCE = 1e-6  # relative singular value below which motors do not driv
 def require_u(u: Any, mechanism: Mechanism, what: str = "the controller's u") -> Array:
     """Return u as an array of shape (d,). Its entries may be NaN or infinite.
 
+    In a table, independent coordinates without an entry have zero force. A number stands for one freedom.
+
     Raises
     ------
     InputError
-        u is not a vector of numbers, or not of that length.
+        u is not a vector of numbers, not of that length, or names something that is not an independent coordinate.
     """
+    if isinstance(u, Mapping):
+        names = mechanism.independent
+        unknown = next((name for name in u if name not in names), None)
+        if unknown is not None:
+            remedy = "; motor torques are what a method tau returns" if unknown in mechanism.actuated else ""
+            raise InputError(
+                f"{what}: no independent coordinate {unknown!r}; there are {', '.join(names)}"
+                f"{remedy or suggest_name(unknown, names)}"
+            )
+        wrong = next((name for name in u if not is_number(u[name])), None)
+        if wrong is not None:
+            raise InputError(f"{what}: {wrong} = {u[wrong]!r:.80}: expected a number")
+        u = [u.get(name, 0.0) for name in names]
     return _vector(u, mechanism.independent, what)
 
 
 def require_tau(tau: Any, mechanism: Mechanism, what: str = "the controller's tau") -> Array:
     """Return torques as an array by motor. Its entries may be NaN or infinite.
 
-    In a table, motors without an entry have zero torque.
+    In a table, motors without an entry have zero torque. A number stands for one motor.
 
     Raises
     ------
@@ -59,6 +75,10 @@ def _vector(value: Any, names: Sequence[str], what: str) -> Array:
         vector = array.astype(float, copy=False)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what}: expected a vector of numbers, got {value!r:.80}") from None
+    if vector.shape == ():
+        if len(names) != 1:
+            raise InputError(f"{what}: expected {len(names)} numbers ({', '.join(names)}), got the number {vector:g}")
+        return vector.reshape(1)
     if vector.shape != (len(names),):
         raise InputError(f"{what}: expected shape ({len(names)},) ({', '.join(names)}), got {vector.shape}")
     return vector

@@ -47,8 +47,11 @@ CONTROLLER_FORMS = (
 class Controller(Protocol):
     """A controller that returns eq. 6's force u."""
 
-    def u(self, t: float, terms: Terms) -> Array:
-        """Return the force on the independent coordinates at time t (s), shape (d,), N m or N."""
+    def u(self, t: float, terms: Terms) -> Array | Mapping[str, float] | float:
+        """Return the force on the independent coordinates at time t (s), N m or N.
+
+        Shape (d,), or a table by coordinate without those that are zero. A number with one freedom.
+        """
 
 
 class ControllerWithState(Protocol):
@@ -70,8 +73,11 @@ class ControllerWithState(Protocol):
 class TorqueController(Protocol):
     """A controller that returns motor torques."""
 
-    def tau(self, t: float, terms: Terms) -> Array | Mapping[str, float]:
-        """Return torques at time t (s), N m or N: shape (motors,), or a table by motor without those that are zero."""
+    def tau(self, t: float, terms: Terms) -> Array | Mapping[str, float] | float:
+        """Return torques at time t (s), N m or N.
+
+        Shape (motors,), or a table by motor without those that are zero. A number with one motor.
+        """
 
 
 ControlLaw = Callable[[float, Terms], Any]  # a controller as a plain function from (t, terms) to u
@@ -143,7 +149,8 @@ def require_no_memory(controller: Controller | TorqueController, start: Terms, o
 
     try:
         first, _, again = law(start.t, start), law(other.t, other), law(start.t, start)
-        differs = not np.array_equal(np.asarray(first, dtype=float), np.asarray(again, dtype=float), equal_nan=True)
+        (names, values), (names_again, values_again) = _names_and_values(first), _names_and_values(again)
+        differs = names != names_again or not np.array_equal(values, values_again, equal_nan=True)
     except Exception:  # The run calls it again and reports what is wrong with it.
         return
     if differs:
@@ -153,6 +160,13 @@ def require_no_memory(controller: Controller | TorqueController, start: Terms, o
             "calls it in any order; a controller with memory or noise runs as "
             "ckc_pin.Sampled(controller, sample_time), which calls it once a sample"
         )
+
+
+def _names_and_values(result: Any) -> tuple[list[str], Array]:
+    """Return the sorted names of a table that a controller returned, none of an array, and the values."""
+    if isinstance(result, Mapping):
+        return sorted(result), np.array([result[name] for name in sorted(result)], dtype=float)
+    return [], np.asarray(result, dtype=float)
 
 
 def _require_lyapunov(function: Any) -> None:

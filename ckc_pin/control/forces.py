@@ -131,6 +131,14 @@ class Force:
         for key, value in {"frame": placed, "parts": parts, "axes": axes, "name": name}.items():
             object.__setattr__(self, key, value)
 
+    def as_spec(self) -> LinkForceSpec | None:
+        """Return its table in a scene; None if it is a function of the state."""
+        constant = [part for part in self.parts if not callable(part)]
+        if len(constant) < len(self.parts):
+            return None
+        vectors: list[Vector3] = [(float(x), float(y), float(z)) for x, y, z in constant]
+        return LinkForceSpec(self.frame, self.name, self.axes, force=vectors[0], moment=vectors[1])
+
 
 def _require_vector(value: Any, name: str) -> Array | VectorFunction:
     """Return a vector (3,), zero for None, or a function of (t, terms)."""
@@ -222,11 +230,6 @@ def build_force(force: LinkForceSpec | Force, mechanism: Mechanism, sources: Sou
     in_world = force.axes == "world"
     if isinstance(force, LinkForceSpec):
         return BodyForce(name, frame, in_world, force, _read_values(force, sources, where))
-    constant = [part for part in force.parts if not callable(part)]
-    if len(constant) == len(force.parts):
-        vectors: list[Vector3] = [(float(x), float(y), float(z)) for x, y, z in constant]
-        spec = LinkForceSpec(force.frame, name, force.axes, force=vectors[0], moment=vectors[1])
-        return BodyForce(name, frame, in_world, spec, _constant(np.concatenate(constant)))
     functions = [part if callable(part) else (lambda t, terms, part=part: part) for part in force.parts]
     spec = LinkForceSpec(force.frame, name, force.axes)
     return BodyForce(name, frame, in_world, spec, None, (functions[0], functions[1]))

@@ -63,7 +63,7 @@ class AllocationSpec(FileStruct, frozen=True):
 
 
 class SensorSpec(FileStruct, frozen=True):
-    """Sensors of a sampled controller's q and q_dot. Values are numbers, or tables by coordinate.
+    """Sensors of a sampled controller's q and q_dot. Values are numbers, or tables or lists by coordinate.
 
     Noise is added to the position before quantization, and to the rate.
 
@@ -99,7 +99,9 @@ class SensorSpec(FileStruct, frozen=True):
 
 
 class DriveSpec(FileStruct, frozen=True):
-    """Drives of a sampled controller, which quantize torques and limit their rates. Values may be tables by motor.
+    """Drives of a sampled controller, which quantize torques and limit their rates.
+
+    Values may be tables by motor, or lists in the order of the motors.
 
     Attributes
     ----------
@@ -121,7 +123,7 @@ class _ControllerSpec(FileStruct, frozen=True, kw_only=True, tag_field="type"):
     Attributes
     ----------
     torque_limit : N m, N
-        Limit of |tau| in addition to the motors' own limits; a table is by motor.
+        Limit of |tau| in addition to the motors' own limits; a table is by motor, a list in the order of the motors.
         ``torque_limit = {theta_1 = 30.0, theta_3 = 20.0}``
     """
 
@@ -182,7 +184,7 @@ class SetPointSpec(_FeedbackSpec, frozen=True, tag="set_point"):
         Positive semi-definite; the same forms.
         ``K_V = {theta_1 = 1.0, theta_3 = 2.0}``
     q_d : rad, m
-        The target.
+        The target; a list is in the order of ``independent``.
         ``q_d = {theta_1 = -1.0, theta_3 = -2.0}``
     """
 
@@ -203,7 +205,8 @@ class TrackingSpec(_FeedbackSpec, frozen=True, tag="tracking"):
         Symmetric positive definite.
         ``K_D = [[10.0, 0.0], [0.0, 10.0]]``
     desired
-        A table for each independent coordinate, or ``file``, or ``point`` with its path.
+        A table for each independent coordinate, a list of them in the order of ``independent``, or ``file``, or
+        ``point`` with its path.
         ``desired = {theta_1 = {offset = -1.4}, theta_3 = {harmonics = [[0.2, 1.0, 0.0]]}}``
     """
 

@@ -7,7 +7,7 @@ controller that uses it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.base.linear_algebra import Factorization
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
-from ckc_pin.base.validation import require_table
+from ckc_pin.base.toml_writer import to_toml_value
+from ckc_pin.base.validation import is_array, require_table
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.sigma import sigma
@@ -195,16 +196,21 @@ class Terms(HasSummary):
         return self.rho.T @ (self.D_tree @ self.rho_dot_times(x) + self.C_tree @ (self.rho @ x))
 
 
-def terms(mechanism: Mechanism | str | Path, q: Mapping[str, float], v: Mapping[str, float] | None = None) -> Terms:
+def terms(
+    mechanism: Mechanism | str | Path,
+    q: Mapping[str, float] | Sequence[float] | Array,
+    v: Mapping[str, float] | Sequence[float] | Array | None = None,
+) -> Terms:
     """Return the terms of the equations of motion at one state.
 
     Parameters
     ----------
     mechanism : Mechanism, or a name or path as for `load`
-    q : {coordinate: value}
+    q : {coordinate: value} or array
         Either the independent coordinates: sigma closes the loops, on the assembled branch. Or all coordinates: they
-        are used as they are, whether they close the loops or not.
-    v : {coordinate: value}, optional
+        are used as they are, whether they close the loops or not. An array is in the order of `independent` or of
+        `coordinates`.
+    v : {coordinate: value} or array, optional
         Either independent velocities, zero by default: v' = rho q_dot. Or all velocities, used as they are.
 
     Raises
@@ -215,9 +221,9 @@ def terms(mechanism: Mechanism | str | Path, q: Mapping[str, float], v: Mapping[
         The configuration is singular.
     """
     mechanism = as_mechanism(mechanism, "terms")
-    v = {} if v is None else v
-    for name, table in (("q", q), ("v", v)):
-        require_table(table, f"terms: {name}", f"a table by coordinate, as {{{mechanism.coordinates[0]!r}: 0.4}}")
+    q, v = (
+        _as_table(mechanism, values, f"terms: {name}") for name, values in (("q", q), ("v", {} if v is None else v))
+    )
     at = _kinematics_at(mechanism, q)
     if set(v) >= set(mechanism.coordinates) and mechanism.dependent:
         return Terms(mechanism, at, mechanism.vector(v, mechanism.coordinates, "v"))
@@ -225,6 +231,15 @@ def terms(mechanism: Mechanism | str | Path, q: Mapping[str, float], v: Mapping[
     if at.phi_z_factor.singular:
         raise NumericalError("phi_z is singular here: rho does not exist", q_tree=dict(q))
     return Terms(mechanism, at, at.rho @ q_dot)
+
+
+def _as_table(mechanism: Mechanism, values: Any, where: str) -> Mapping[str, float]:
+    """Return values by coordinate; an array is in the order of `independent` or `coordinates` (InputError)."""
+    if is_array(values):
+        return mechanism.name_values(to_toml_value(values), where, mechanism.independent, mechanism.coordinates)
+    expected = f"a table by coordinate, as {{{mechanism.coordinates[0]!r}: 0.4}}, or an array"
+    require_table(values, where, expected)
+    return dict(values)
 
 
 def _kinematics_at(mechanism: Mechanism, q: Mapping[str, float]) -> Kinematics:

@@ -17,6 +17,7 @@ import numpy as np
 from ckc_pin.base.interrupt import acknowledge, interrupt_again, uninterrupted_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Summary
+from ckc_pin.base.toml_writer import to_toml_value
 from ckc_pin.base.validation import describe_value, require_flag, require_path, require_table, require_type
 from ckc_pin.ensembles.members import DONE, STOPPED, Chunk, Members, SweepTask
 from ckc_pin.ensembles.outputs import Function
@@ -26,7 +27,8 @@ from ckc_pin.ensembles.store import RESULTS, RESUME_HINT, Store, require_librari
 from ckc_pin.ensembles.store_layout import array_name
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, to_toml_value
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES
+from ckc_pin.scene.scene import EXPECTED_SCENE, Scene
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -96,7 +98,7 @@ class SweepResult(HasSummary):
 
 
 def ensemble(
-    scene: str | Path,
+    scene: Scene | str | Path,
     variables: Mapping[str, Any],
     outputs: Mapping[str, str | Mapping[str, Any] | Function],
     *,
@@ -114,8 +116,8 @@ def ensemble(
 
     Parameters
     ----------
-    scene : str or Path
-        A scene's shipped name, or its path.
+    scene : Scene, str or Path
+        A scene, its shipped name, or its path. Its controller is described by a table, not by an object of Python.
     variables : mapping
         Distribution of each variable, by the name of a parameter or a key of the scene. ``{"uniform": [a, b]}``,
         "loguniform", "sobol" or "lhs" from a to b; ``{"normal": [mean, deviation]}``, or "lognormal" with those of the
@@ -168,9 +170,10 @@ def ensemble(
     require_libraries()
     functions = {name: output for name, output in outputs.items() if callable(output)}
     data: dict[str, Any] = {
-        "scene": str(scene), "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
-        "variables": {name: _to_data(x) for name, x in variables.items()},
-        "outputs": {name: _to_data(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
+        "scene": scene.name if isinstance(scene, Scene) else str(scene),
+        "seed": to_toml_value(seed), "overrides": to_toml_value(overrides or {}),
+        "variables": {name: to_toml_value(x) for name, x in variables.items()},
+        "outputs": {name: to_toml_value(x) for name, x in outputs.items() if name not in functions} or {"t": "t"},
     }  # fmt: skip
     if members is not None:
         data["members"] = to_toml_value(members)
@@ -194,7 +197,12 @@ def ensemble(
 
 def _require_tables(scene: Any, variables: Any, outputs: Any, overrides: Any) -> None:
     """Refuse arguments of wrong type that describe the sweep (InputError); their content is checked later."""
-    require_type(scene, (str, Path), "ensemble: scene", "a scene's shipped name or its path")
+    require_type(scene, (Scene, str, Path), "ensemble: scene", EXPECTED_SCENE)
+    if isinstance(scene, Scene) and (scene.controller is not None or scene.events):
+        raise InputError(
+            "ensemble: scene: a controller or event that is an object of Python is not supported, because members run "
+            'in native threads and other processes; give a table, as controller={"type": "set_point", ...}'
+        )
     require_table(variables, "ensemble: variables", 'a table by name, as {"link.link_2.mass": {"uniform": [0.2, 0.3]}}')
     require_table(outputs, "ensemble: outputs", 'a table by name, as {"end": "q_tree"}')
     if overrides is not None:
@@ -213,10 +221,6 @@ def _require_resources(out: Any, threads: Any, workers: Any, scheduler: Any, chu
             raise InputError(f"ensemble: {name}: expected a whole number of at least 1, got {describe_value(count)}")
     if scheduler and workers:
         raise InputError("ensemble: workers and scheduler: give one of them")
-
-
-def _to_data(value: Any) -> Any:
-    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else to_toml_value(value)
 
 
 # --- sweeps ----------------------------------------------------------------------------------------
@@ -364,7 +368,7 @@ def save_worst_members(
         values = np.array([float(results[array_name(variable)][k]) for variable in members.names])
         folder = out / f"worst_{array_name(name)}_{k}"
         try:
-            run = simulate(members.scene_name, members.overrides_of(values))
+            run = simulate(members.scene_of(values))
         except CkcError:
             continue
         if run.status == "interrupted":

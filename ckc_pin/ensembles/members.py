@@ -38,7 +38,8 @@ from ckc_pin.run.prepare import prepare
 from ckc_pin.run.simulate import build_run, record_rows
 from ckc_pin.scene.initial import find_branch
 from ckc_pin.scene.parts import rebuild_scene_mechanism
-from ckc_pin.scene.scene import Scene, load_scene
+from ckc_pin.scene.saving import scene_texts
+from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["DONE", "FAILED", "PENDING", "STATUS", "STOPPED", "Chunk", "MemberNumbers", "Members", "SweepTask"]
 
@@ -64,7 +65,7 @@ class SweepTask:
     spec : SweepSpec
     name : str
         Name of the sweep in messages.
-    scene : str or Path
+    scene : Scene, str or Path
     folder : Path or None
         Folder of the files of values.
     functions : dict of str to callable
@@ -75,7 +76,7 @@ class SweepTask:
 
     spec: SweepSpec
     name: str
-    scene: str | Path
+    scene: Scene | str | Path
     folder: Path | None
     functions: Mapping[str, Function] = field(default_factory=dict)
     terms: str | None = None
@@ -99,7 +100,10 @@ class SweepTask:
         functions = sorted(
             (name, getattr(f, "__qualname__", type(f).__qualname__)) for name, f in self.functions.items()
         )
-        content = (msgspec.to_builtins(self.spec), str(self.scene), str(self.folder), functions, self.terms)
+        scene: Any = str(self.scene)
+        if isinstance(self.scene, Scene):
+            scene = scene_texts(self.scene, self.scene.name)
+        content = (msgspec.to_builtins(self.spec), scene, str(self.folder), functions, self.terms)
         return sha256(msgspec.json.encode(content, order="deterministic")).hexdigest()
 
 
@@ -134,7 +138,7 @@ class Members:
 
     Parameters
     ----------
-    scene : str or Path
+    scene : Scene, str or Path
     overrides : mapping
         Overrides of the scene, for all members.
     names : sequence of str
@@ -153,19 +157,19 @@ class Members:
 
     def __init__(
         self,
-        scene: str | Path,
+        scene: Scene | str | Path,
         overrides: Mapping[str, Any],
         names: tuple[str, ...],
         outputs: Mapping[str, str | OutputSpec | Function],
         count: int,
         threads: int,
     ) -> None:
-        self.scene_name, self._overrides, self.names = scene, dict(overrides), names
+        self._overrides, self.names = dict(overrides), names
         self._threads = threads
-        self.scene: Scene = load_scene(scene, overrides)
+        self.scene = as_scene(scene, overrides, "ensemble")
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
-        self._vectors = check_variable_names(scene, self._overrides, self.scene, self.mechanism, names)
+        self._vectors = check_variable_names(self.scene, self.mechanism, names)
         self._output_specs = outputs
         self._has_fixed_mechanism = not any(is_parameter(name) for name in names)
         self.outputs = Outputs(outputs, self.ready, has_fixed_mechanism=self._has_fixed_mechanism)
@@ -177,7 +181,6 @@ class Members:
         self._numbers = MemberNumbers(parameters, [names[k] for k in self._parameters])
         self._library = self._select_library(count)
         self.terms = "pinocchio" if self._library is None else "generated"
-        self._overrides["solver.terms"] = self.terms
         self.shapes = self._find_shapes()
         self.is_batched = self._can_be_batched()
         self._batch: Any = None
@@ -213,9 +216,17 @@ class Members:
         rhs += self._run_separately(np.flatnonzero(status == PENDING), values, status, message, outputs)
         return Chunk(first, values, status, message, outputs, rhs)
 
+    def scene_of(self, values: Array) -> Scene:
+        """Return the scene of a member, which `simulate` runs as the ensemble does."""
+        return self.scene.with_overrides(self._values_by_key(values))
+
     def overrides_of(self, values: Array) -> dict[str, Any]:
         """Return a member's overrides. `simulate` and `ckc run` do the same run with them."""
-        overrides = dict(self._overrides)
+        return {**self._overrides, **self._values_by_key(values)}
+
+    def _values_by_key(self, values: Array) -> dict[str, Any]:
+        """Return the terms, and the values of a member's variables, by key of the scene; vectors are complete."""
+        overrides: dict[str, Any] = {"solver.terms": self.terms}
         for name, value in zip(self.names, values, strict=True):
             vector = self._vectors.get(name)
             if vector is not None:  # the scene gives all three components
@@ -334,7 +345,7 @@ class Members:
                 raise KeyboardInterrupt
 
         try:
-            ready = prepare(load_scene(self.scene_name, self.overrides_of(values)))
+            ready = prepare(self.scene_of(values))
             rows, ended, message = record_rows(ready, require_not_cancelled)
         except CkcError as error:
             return FAILED, str(error), 0

@@ -7,8 +7,6 @@ import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from io import StringIO
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from ckc_pin.ensembles.spec import KINDS, MAX_MEMBERS, GridSpec, SweepSpec, Vari
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, Value, is_parameter, require_known, values_of, with_components
-from ckc_pin.scene.scene import Scene, load_scene
+from ckc_pin.scene.scene import Scene
 
 __all__ = ["Variables", "check_variable_names"]
 
@@ -192,9 +190,7 @@ def _read_column(sources: Sources, file: str, name: str) -> Array:
 # --- names -----------------------------------------------------------------------------------------
 
 
-def check_variable_names(
-    scene_name: str | Path, overrides: Mapping[str, Any], scene: Scene, mechanism: Mechanism, names: tuple[str, ...]
-) -> dict[str, tuple[str, int]]:
+def check_variable_names(scene: Scene, mechanism: Mechanism, names: tuple[str, ...]) -> dict[str, tuple[str, int]]:
     """Check that variables are parameters of the mechanism or numbers of the scene.
 
     Returns
@@ -221,7 +217,7 @@ def check_variable_names(
             vectors[name] = (vector, AXES.index(axis))
     for name in names:
         if not is_parameter(name):
-            _require_number_of_scene(scene_name, overrides, scene, mechanism, name)
+            _require_number_of_scene(scene, mechanism, name)
     return vectors
 
 
@@ -235,18 +231,16 @@ def _require_known_distribution(scene: Scene, mechanism: Mechanism, present: Map
         raise InputError(f"{scene.name}: variables: {number}: unknown key {kind!r}; valid: {', '.join(KINDS)}")
 
 
-def _require_number_of_scene(
-    scene_name: str | Path, overrides: Mapping[str, Any], scene: Scene, mechanism: Mechanism, name: str
-) -> None:
+def _require_number_of_scene(scene: Scene, mechanism: Mechanism, name: str) -> None:
     """Refuse a key of the scene that does not take a number (InputError)."""
     for prefix, names in zip(START_PREFIXES, (mechanism.coordinates, mechanism.independent), strict=True):
         if name.startswith(prefix):
             if name.removeprefix(prefix) not in names:
                 raise InputError(f"{scene.name}: variables: {name!r}: no such coordinate; there are {', '.join(names)}")
-            load_scene(scene_name, {**overrides, name: 1.0})  # rejects the same starts as a single run
+            scene.with_overrides({name: 1.0})  # rejects the same starts as a single run
             return
     try:
-        load_scene(scene_name, {**overrides, name: 1})
+        scene.with_overrides({name: 1})
     except InputError as error:
         # A message about the range of a number shows that the key takes one.
         if "greater than" in str(error) or "at least" in str(error) or "less than" in str(error):

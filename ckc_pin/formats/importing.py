@@ -6,16 +6,16 @@ Supported: MuJoCo's MJCF, and URDFs whose loops are declared by <loop> (generali
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 
 from ckc_pin.base.sources import parse_xml, write_texts
 from ckc_pin.base.toml import read_text
+from ckc_pin.base.toml_writer import LINE_WIDTH, format_key, format_value, to_table
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft, choose_independent
 from ckc_pin.formats.mjcf.reader import read_mjcf
@@ -25,7 +25,6 @@ from ckc_pin.mechanism.spec import LoopType
 
 __all__ = ["Draft", "mechanism_text", "read", "write"]
 
-LINE_WIDTH = 116  # characters of ``mechanism.toml``
 LOOP_TYPES = get_args(LoopType)
 
 
@@ -109,13 +108,17 @@ def mechanism_text(draft: Draft) -> str:
         if items:
             lines += [f"# {title}:", *(line for item in items for line in _comment(item, "#   - ", "#     ")), ""]
     spec = draft.to_spec()
-    lines += [f"name = {_value(spec.name)}", f"urdf = {_value(draft.urdf_file)}", f"gravity = {_value(spec.gravity)}"]
+    lines += [
+        f"name = {format_value(spec.name)}",
+        f"urdf = {format_value(draft.urdf_file)}",
+        f"gravity = {format_value([*map(float, spec.gravity)])}",
+    ]
     if draft.independent is not None:
         lines += _comment(draft.why_independent) + _name_list("independent", draft.independent)
     if spec.actuated is not None:
         lines += _name_list("actuated", spec.actuated)
     if draft.q_guess:
-        lines += ["", "[q_guess]", *(f"{_key(k)} = {_value(v)}" for k, v in draft.q_guess.items())]
+        lines += ["", "[q_guess]", *(f"{format_key(k)} = {format_value(float(v))}" for k, v in draft.q_guess.items())]
     tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
         "loop": draft.loops,
         "coupling": draft.couplings,
@@ -142,45 +145,24 @@ def _loop_template(draft: Draft) -> Iterator[str]:
     yield from _comment(f"No loop is closed. Complete this table to close one; type is one of {', '.join(LOOP_TYPES)}:")
     yield "# [[loop]]"
     table = {"name": "closed", "type": "hinge"}
-    yield from (f"# {key} = {_value(value)}" for key, value in table.items())
+    yield from (f"# {key} = {format_value(value)}" for key, value in table.items())
     for key, end in (("frame_a", ends[-1]), ("frame_b", other)):
-        yield f"# {key} = {{link = {_value(end)}, xyz = [0.0, 0.0, 0.0], rpy = [0.0, 0.0, 0.0]}}"
+        yield f"# {key} = {{link = {format_value(end)}, xyz = [0.0, 0.0, 0.0], rpy = [0.0, 0.0, 0.0]}}"
     yield from (f"# axis_{end} = [0.0, 0.0, 1.0]" for end in "ab")
 
 
 def _entries(spec: msgspec.Struct) -> Iterator[str]:
-    """Yield the keys of a table whose values differ from the defaults."""
-    for field in msgspec.structs.fields(spec):
-        value = getattr(spec, field.name)
-        factory = field.default_factory
-        if field.required or value != (field.default if factory is msgspec.NODEFAULT else factory()):
-            yield f"{_key(field.encode_name)} = {_value(value)}"
+    """Yield the keys of a table whose values differ from the defaults. Conversion turns integers into numbers."""
+    table = to_table(msgspec.convert(msgspec.to_builtins(spec), type(spec)))
+    yield from (f"{format_key(key)} = {format_value(value)}" for key, value in table.items())
 
 
 def _name_list(key: str, names: Iterable[str]) -> list[str]:
     """Return a list of names as TOML, one name a line where one line would be too long."""
-    one_line = f"{key} = {_value(list(names))}"
+    one_line = f"{key} = {format_value(list(names))}"
     if len(one_line) <= LINE_WIDTH:
         return [one_line]
-    return [f"{key} = [", *(f"    {_value(name)}," for name in names), "]"]
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float | int):
-        return repr(float(value))
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_value(x) for x in value)}]"
-    keys = {f.encode_name: getattr(value, f.name) for f in msgspec.structs.fields(value)}
-    pairs = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in keys.items() if isinstance(v, str) or any(v))
-    return f"{{{pairs}}}"
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _value(key)
+    return [f"{key} = [", *(f"    {format_value(name)}," for name in names), "]"]
 
 
 def _comment(text: str, first: str = "# ", rest: str = "# ") -> list[str]:

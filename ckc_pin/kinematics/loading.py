@@ -20,7 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec
 
-__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "load"]
+__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "check_overrides", "load"]
 
 
 class MechanismCache:
@@ -94,13 +94,20 @@ def load(
         The mechanism cannot exist as described.
     """
     require_type(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
-    return build(*read_mechanism_texts(name), None if overrides is None else _check_overrides(overrides), prescribed)
+    checked = None if overrides is None else check_overrides(overrides, "load: overrides")
+    return build(*read_mechanism_texts(name), checked, prescribed)
 
 
-def _check_overrides(overrides: Any) -> Overrides:
-    """Return overrides with Python floats, and vectors as tuples of three."""
+def check_overrides(overrides: Any, where: str) -> Overrides:
+    """Return parameter values with Python floats, and vectors as tuples of three.
+
+    Raises
+    ------
+    InputError
+        They are no table of numbers and vectors by name. The message begins with `where`.
+    """
     expected = 'a table of numbers by name, three of a vector, as {"link.link_2.mass": 0.3}'
-    require_table(overrides, "load: overrides", expected)
+    require_table(overrides, where, expected)
     checked: dict[str, Any] = {}
     for name, override in overrides.items():
         if override is None:
@@ -109,10 +116,10 @@ def _check_overrides(overrides: Any) -> Overrides:
         is_vector = isinstance(value, list | tuple)
         for x in value if is_vector else (value,):
             if not is_number(x) or not abs(x) <= sys.float_info.max:
-                raise InputError(f"load: overrides: {name} = {override!r:.80}: expected {expected}")
+                raise InputError(f"{where}: {name} = {override!r:.80}: expected {expected}")
         checked[name] = tuple(map(float, value)) if is_vector else float(value)
         if is_vector and len(value) != 3:
-            raise InputError(f"load: overrides: {name}: expected 3 numbers, got {len(value)}")
+            raise InputError(f"{where}: {name}: expected 3 numbers, got {len(value)}")
     return checked
 
 

@@ -13,6 +13,7 @@ from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.forces import BodyForce
+from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.dynamics.formulations import tree_force
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
@@ -23,8 +24,9 @@ from ckc_pin.native.control import actuation_table, apply_u, law_table
 from ckc_pin.native.plant import NONE, Plant
 from ckc_pin.native.tables import core_table
 
-__all__ = ["ClosedLoop", "Feedback", "LimitedClosedLoop"]
+__all__ = ["LAWS", "ClosedLoop", "Feedback", "LimitedClosedLoop"]
 
+LAWS = (SetPoint, Tracking)  # controllers whose derivatives are known; a subclass may compute another u
 NOT_DIFFERENTIABLE = (
     "the independent coordinates do not parametrize the motion or belong to a free root, or motors that share a force "
     "are at their limits"
@@ -63,6 +65,7 @@ class ClosedLoop:
     ----------
     mechanism : Mechanism
     law : SetPoint or Tracking
+        Not of a subclass, whose u may be another one.
     smoothing : float, optional
         The scene's friction_smoothing.
     library : Library, optional
@@ -92,7 +95,18 @@ class ClosedLoop:
     @law.setter
     def law(self, law: SetPoint | Tracking) -> None:
         self._law = law
-        self._native = _core.Feedback(self._table, self._actuation | {"law": law_table(law)})
+        self._native = None if law_table(law) is None else self._make_native(law)
+
+    def _make_native(self, law: SetPoint | Tracking) -> _core.Feedback:
+        return _core.Feedback(self._table, self._actuation | {"law": law_table(law)})
+
+    def _native_at(self, t: float) -> _core.Feedback:
+        """Return the native controller. A desired motion that is a function in Python has its values at t there."""
+        if self._native is not None or not isinstance(self._law, Tracking):
+            return self._native or self._make_native(self._law)
+        q_d, q_d_dot, q_d_ddot = (np.asarray(x, dtype=float) for x in self._law.desired(t))
+        parabola = PiecewisePolynomial(np.array([t, t + 1.0]), np.array([0.5 * q_d_ddot, q_d_dot, q_d])[:, np.newaxis])
+        return self._make_native(Tracking(self._law.Lambda, self._law.K_D, parabola, self._law.model))
 
     def linearize(
         self,
@@ -122,7 +136,7 @@ class ClosedLoop:
         NumericalError
             J has lost rank, or the controller is not differentiable at this state.
         """
-        mechanism, derivatives = self._plant.mechanism, self._native.at(t, terms.q_tree, terms.v_tree)
+        mechanism, derivatives = self._plant.mechanism, self._native_at(t).at(t, terms.q_tree, terms.v_tree)
         if not isinstance(derivatives, tuple):
             reason = derivatives or NOT_DIFFERENTIABLE
             raise NumericalError(f"{mechanism.name}: the controller cannot be differentiated there: {reason}")

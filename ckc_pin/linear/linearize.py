@@ -13,20 +13,19 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import is_number, require_table, require_type
+from ckc_pin.base.toml_writer import to_toml_value
+from ckc_pin.base.validation import is_array, is_number, require_table, require_type
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.build import SceneController
-from ckc_pin.control.controllers import RecordedTorques, SetPoint
+from ckc_pin.control.controllers import Controller, SetPoint, TorqueController, Tracking
 from ckc_pin.control.forces import BodyForce
-from ckc_pin.control.joint_servo import JointServo
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.equilibrium import equilibrium
 from ckc_pin.dynamics.terms import Terms, terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import minimum_norm_step, project_onto_closure, sigma
-from ckc_pin.linear.closed_loop import ClosedLoop
+from ckc_pin.linear.closed_loop import LAWS, ClosedLoop
 from ckc_pin.linear.linear_model import LinearModel, linear_model
 from ckc_pin.linear.statics import balance_at_rest
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -38,17 +37,20 @@ from ckc_pin.run.inverse import RecordedJoints
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.names import is_scene_name
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES
 from ckc_pin.scene.parts import (
+    apply_sampling,
     build_scene_actuation,
     build_scene_controller,
     build_scene_forces,
     load_scene_mechanism,
 )
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, is_scene_name, load_scene, make_scene
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["At", "linearize"]
 
-At = str | float | Mapping[str, float]
+At = str | float | Mapping[str, float] | Sequence[float] | Array
 
 MIN_CHART_MARGIN = 1e-6  # margin of phi_z, below which q does not determine z to all digits
 CLOSURE_TOLERANCE = 1e-6  # |phi| relative to the mechanism's size
@@ -96,12 +98,13 @@ def linearize(
     ----------
     what : Mechanism, Scene, str or Path
         As in `check`. A mechanism's name with `overrides` or with a time stands for its default scene.
-    at : "equilibrium", "assembled", "target", float or {coordinate: value}
+    at : "equilibrium", "assembled", "target", float, {coordinate: value} or array
         The state:
 
         - "equilibrium": the stable equilibrium reached from q_guess, without motor torques.
         - "assembled" or coordinates: at rest there. Loaded stops and minimum-norm motor torques hold the mechanism, and
-          dry friction if these are not sufficient. Motors share the torques as in a run.
+          dry friction if these are not sufficient. Motors share the torques as in a run. An array is in the order of
+          `independent` or of `coordinates`.
         - "target": the target of the scene's set point, with the controller's torques.
         - a number: that time of the scene's run, s.
     overrides : mapping, optional
@@ -138,6 +141,9 @@ def linearize(
         subject = _find_subject(what, at, overrides)
         if subject.mechanism.d == 0:
             raise InputError(f"{subject.mechanism.name}: d = 0, the mechanism has no freedom to linearize")
+        if is_array(at):
+            mechanism = subject.mechanism
+            at = mechanism.name_values(to_toml_value(at), "linearize: at", mechanism.independent, mechanism.coordinates)
         if isinstance(at, Mapping):
             return _linearize_at_coordinates(subject, at)
         if not isinstance(at, str):
@@ -155,12 +161,14 @@ def linearize(
 
 def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mapping[str, Any] | None) -> _Subject:
     if isinstance(what, str | Path):
-        needs_run = not isinstance(at, Mapping | str)
+        needs_run = not (isinstance(at, Mapping | str) or is_array(at))
         if not (is_scene_name(str(what)) or overrides or needs_run):
             return _Subject(load(what), None)
         what = load_scene(what, overrides)
+    elif isinstance(what, Scene):
+        what = what.with_overrides(overrides)
     elif overrides:
-        raise InputError("linearize: overrides are accepted only with a name or path, not with a Scene or a Mechanism")
+        raise InputError("linearize: overrides are accepted with a scene, not with a Mechanism")
     if not isinstance(what, Scene):
         return _Subject(what, None)
     mechanism = load_scene_mechanism(what)
@@ -176,7 +184,8 @@ def _require_time(at: Any) -> float:
 
 def _unknown_state(at: Any) -> InputError:
     return InputError(
-        f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or a table of coordinates'
+        f'at = {at!r:.80}: give "equilibrium", "assembled", "target", a time in seconds, or coordinates as a table or '
+        "an array"
     )
 
 
@@ -308,14 +317,14 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
 def _add_closed_loop(
     subject: _Subject,
     model: LinearModel,
-    law: SceneController,
+    law: Controller | TorqueController,
     t: float,
     state: Terms,
     friction: Array | float,
     forces: Sequence[BodyForce] = (),
 ) -> LinearModel:
     """Add the closed loop to a model, or a note why it has none."""
-    if isinstance(law, RecordedTorques | JointServo):
+    if not isinstance(law, SetPoint | Tracking) or type(law) not in LAWS:
         return replace(model, notes=(*model.notes, "A and B are the plant's, without the scene's controller"))
     locked = np.array([model.coordinates.index(name) for name in model.locked], np.intp)
     try:
@@ -325,9 +334,9 @@ def _add_closed_loop(
         note = f"A and B are the plant's, without the scene's controller, because {error}"
         return replace(model, notes=(*model.notes, note))
     note = "A and B are the plant's; closed_loop is A with the scene's controller"
-    spec = None if subject.scene is None else subject.scene.spec.controller
-    if isinstance(spec, FeedbackSpec) and spec.sample_time is not None:
-        parts = {"delay": spec.delay > 0, "sensor": spec.sensor is not None, "drive": spec.drive is not None}
+    sampled = None if subject.scene is None else apply_sampling(subject.scene, law)
+    if isinstance(sampled, Sampled):
+        parts = {"delay": sampled.delay > 0, "sensor": sampled.sensor is not None, "drive": sampled.drive is not None}
         ignored = ["sampling", *(name for name, is_present in parts.items() if is_present)]
         note += f", without its {', '.join(ignored)}"
     return replace(model, closed_loop=A_closed, notes=(*model.notes, note))
@@ -348,7 +357,7 @@ def _run_until(scene: Scene, t: float) -> Run:
     if not 0 <= t <= t_end:
         raise InputError(f"t = {t:.15g} s is outside the run of {scene.name}, which lasts from 0 to {t_end:.15g} s")
     overrides = {"t_end": max(t, min(MIN_DURATION_S, t_end))}
-    run = simulate(make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources))
+    run = simulate(scene, overrides)
     if run.status == "interrupted":
         raise interrupt_again(run.message)
     if run.status == "done" and run.t[-1] >= t * (1 - 1e-12):

@@ -18,12 +18,13 @@ from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
-from ckc_pin.linear.closed_loop import ClosedLoop
+from ckc_pin.linear.closed_loop import LAWS, ClosedLoop
 from ckc_pin.linear.modes import ComplexArray, compute_eigenvalues
 from ckc_pin.run.compiled_terms import select_library
 from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.names import is_scene_name
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
-from ckc_pin.scene.scene import Scene, is_scene_name, load_scene
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["GainLocus", "gain_locus"]
 
@@ -91,7 +92,7 @@ def gain_locus(
     gain : "K_P", "K_V", "K_D" or "Lambda", optional
         A gain of the scene's controller. Default: K_P of a set point and K_D of tracking.
     overrides : mapping, optional
-        Overrides of the scene's keys, if `what` is a name or path.
+        Overrides of the scene's keys.
 
     Returns
     -------
@@ -111,12 +112,12 @@ def gain_locus(
         if not is_scene_name(str(what)):
             return None
         what = load_scene(what, overrides)
-    elif overrides:
-        raise InputError("gain_locus: overrides are accepted only with the name or path of a scene, not with a Scene")
+    else:
+        what = what.with_overrides(overrides)
     what.refuse_forces("gain_locus")
     mechanism = load_scene_mechanism(what)
     law = build_scene_controller(what, mechanism)
-    if not isinstance(law, SetPoint | Tracking):
+    if not isinstance(law, SetPoint | Tracking) or type(law) not in LAWS:
         return None
     gains = GAINS[type(law)]
     if gain is not None and gain not in gains:

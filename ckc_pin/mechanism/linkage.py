@@ -47,6 +47,8 @@ class Linkage:
     urdf : UrdfTree
         All trees of the file, merged into one.
     tree, closure, frames, joints, springs : Tree, Closure, Frames, Joints, Springs
+    overrides : dict
+        Parameter values that replace those of the files.
     prescribed : tuple of str
         Names of the prescribed joints.
     motors : Motors or None
@@ -72,7 +74,7 @@ class Linkage:
             spec, warnings = changed(spec, urdf.root, overrides, sources.name)
             self.warnings += warnings
             text = ElementTree.tostring(urdf.root, encoding="unicode")
-        self.spec, self.sources, self.urdf = spec, sources, urdf
+        self.spec, self.sources, self.urdf, self.overrides = spec, sources, urdf, dict(overrides or {})
         model = _build_model(text, sources.name)
         model.gravity.linear = np.array(spec.gravity)
         self.frames = Frames(model)

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.sources import Sources
+from ckc_pin.base.sources import Sources, write_texts
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
+from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.mechanism.files import local_texts
+from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rank import Freedoms, choose_dependent, compute_rank, idle_coordinates, scale_jacobian
+from ckc_pin.mechanism.spec import CouplingSpec, ForceSpec, JointSpec, LoopSpec, MotorSpec, PointSpec, SpringSpec
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
 
@@ -26,8 +32,13 @@ CONSTRAINED_IN_PART = (
 )
 
 
+Table = Mapping[str, Any]  # a table of a file, as a dict
+
+
 class Mechanism(HasSummary):
-    """A closed kinematic chain: everything that does not depend on the state. `load` returns one.
+    """A closed kinematic chain: everything that does not depend on the state.
+
+    `load` reads one from files, and `Mechanism.from_urdf` makes one in Python.
 
     Parameters
     ----------
@@ -65,6 +76,8 @@ class Mechanism(HasSummary):
         Joints whose motion is prescribed.
     prescribed_at, prescribed_rows : int array, list of int
         Their coordinates, and their constraint rows.
+    overrides : dict
+        Parameter values by name that replace those of the files.
     urdf : Element
         All trees merged into one <robot>, as Pinocchio read it.
     partition : Partition
@@ -89,7 +102,7 @@ class Mechanism(HasSummary):
         independent: Sequence[str] | None = None,
     ) -> None:
         self.spec, self.sources, self.name = linkage.spec, linkage.sources, linkage.spec.name
-        self.urdf = linkage.urdf.root
+        self.urdf, self.overrides = linkage.urdf.root, linkage.overrides
         self.tree, self.closure, self.frames = linkage.tree, linkage.closure, linkage.frames
         self.joints, self.springs = linkage.joints, linkage.springs
         self.points, self.size, self.couplings = linkage.points, linkage.size, linkage.couplings
@@ -105,6 +118,112 @@ class Mechanism(HasSummary):
         self._drop_ineffective_friction()
         self._choose_independent(linkage.motors, self.spec.independent if independent is None else independent)
         self._choose_motors(linkage.motors)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | Path | None = None,
+        *,
+        loops: Sequence[LoopSpec | Table] = (),
+        couplings: Sequence[CouplingSpec | Table] = (),
+        springs: Sequence[SpringSpec | Table] = (),
+        forces: Sequence[ForceSpec | Table] = (),
+        joints: Sequence[JointSpec | Table] = (),
+        motors: Sequence[MotorSpec | Table] = (),
+        points: Sequence[PointSpec | Table] = (),
+        trees: Sequence[Table] = (),
+        name: str | None = None,
+        gravity: Sequence[float] | Array | None = None,
+        independent: Sequence[str] | None = None,
+        actuated: Sequence[str] | None = None,
+        q_guess: Mapping[str, float] | Sequence[float] | Array | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        meshes: str | Path | None = None,
+    ) -> Mechanism:
+        """Make a mechanism without files, from the text or path of a URDF and the tables of a ``mechanism.toml``.
+
+        Parameters
+        ----------
+        urdf : str or Path
+            The text of a URDF, which begins with ``<``, or the path of a URDF.
+        loops : sequence of Loop or dict
+            Loop closures: ``Loop("elbow", "point_2d", "left", "right")`` or the keys of a ``[[loop]]``.
+        couplings, springs, forces, joints, motors, points : sequence of dict
+            Tables with the keys of ``[[coupling]]``, ``[[spring]]`` and so on.
+        trees : sequence of dict
+            Instead of `urdf`, for several trees or a free root: the keys of a ``[[tree]]``, whose ``file`` is the text
+            or path of a URDF.
+        name : str, optional
+            Default: the name of the robot in the text, or of the file.
+        gravity : (3,) array, optional
+            m/s^2; default (0, 0, -9.81).
+        independent, actuated : sequence of str, optional
+            As in the file.
+        q_guess : {coordinate: value} or array, optional
+            Initial guess of the assembly, rad or m. An array is in the order of `independent`, which is then needed.
+        parameters : mapping, optional
+            Parameter values by name that replace those of the URDF and the tables, as in `load`.
+        meshes : str or Path, optional
+            Folder that the URDF's mesh files are relative to; default: the folder of its path.
+
+        Raises
+        ------
+        InputError
+            A wrong argument, an unknown key, or malformed XML.
+        MechanismError
+            The mechanism cannot exist as described.
+
+        Examples
+        --------
+        >>> arm = '''<robot name="pendulum"><link name="base"/>
+        ...   <link name="rod"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
+        ...     <inertia ixx="0.01" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        ...   <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint>
+        ... </robot>'''
+        >>> Mechanism.from_urdf(arm, springs=[{"joint": "hinge", "stiffness": 2.0}]).d
+        1
+        """
+        import ckc_pin
+
+        keys = {
+            "loops": loops, "couplings": couplings, "springs": springs, "forces": forces, "joints": joints,
+            "motors": motors, "points": points, "gravity": gravity, "independent": independent, "actuated": actuated,
+            "q_guess": q_guess,
+        }  # fmt: skip
+        return ckc_pin.kinematics.from_urdf(urdf, trees, name, meshes, parameters, keys)
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the mechanism's files into a folder, which `load` and the commands read.
+
+        Mesh files are not copied; playback takes their folder as ``meshes``.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Created if it does not exist.
+        overwrite : bool
+            Whether existing files may be replaced.
+
+        Returns
+        -------
+        Path
+            Of the ``mechanism.toml``.
+
+        Raises
+        ------
+        InputError
+            A file exists already, the folder cannot be written to, or the mechanism has parameter values or prescribed
+            joints, which only a scene's file can have.
+        """
+        require_path(folder, "Mechanism.save: folder")
+        for names, key in ((self.overrides, "parameters"), (self.prescribed, "prescribed")):
+            if names:
+                raise InputError(
+                    f"Mechanism.save: {key} ({', '.join(names)}) are keys of a scene, and a mechanism.toml has none; "
+                    "save a Scene of the mechanism"
+                )
+        write_texts(Path(folder), local_texts(self), overwrite)
+        return Path(folder) / MECHANISM_FILE
 
     def summary(self) -> Summary:
         """Return closure, loops, coordinates, motors, assembled configuration, points and warnings."""
@@ -192,6 +311,29 @@ class Mechanism(HasSummary):
             if dependent is not None:
                 raise InputError(f"{what}: {dependent!r} follows from the loops; there are {', '.join(names)}")
         return self.tree.vector(values, names, what, fill)
+
+    def name_values(self, values: Sequence[Any], what: str, *choices: Sequence[str]) -> dict[str, Any]:
+        """Return values by name, as a table of a file has them.
+
+        Parameters
+        ----------
+        values : sequence
+            In the order of the names.
+        what : str
+            What the values are, for messages.
+        *choices : sequence of str
+            The names; the first of several choices with as many names as there are values.
+
+        Raises
+        ------
+        InputError
+            There are more or fewer values than names.
+        """
+        names = next((names for names in choices if len(names) == len(values)), None)
+        if names is None:
+            orders = " or ".join(f"{len(names)}, in the order {', '.join(names) or 'none'}" for names in choices)
+            raise InputError(f"{what}: got {len(values)} values; expected {orders}, or a table by name")
+        return dict(zip(names, values, strict=True))
 
     def refuse_prescribed_joints(self, function: str) -> None:
         """Raise InputError if joints are prescribed, for a function that does not support them."""

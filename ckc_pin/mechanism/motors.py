@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import is_number
+from ckc_pin.base.validation import is_number, suggest_name
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.spec import MechanismSpec, MotorSpec
 from ckc_pin.mechanism.tree import Tree
@@ -100,7 +100,8 @@ class Motors:
         """
         unknown = next((name for name in values if name not in self.names), None)
         if unknown is not None:
-            raise InputError(f"{what}: no motor {unknown!r}; there are {', '.join(self.names) or 'none'}")
+            nearest = suggest_name(unknown, self.names)
+            raise InputError(f"{what}: no motor {unknown!r}; there are {', '.join(self.names) or 'none'}{nearest}")
         missing = [name for name in self.names if name not in values]
         if missing and fill is None:
             raise InputError(f"{what}: {', '.join(missing)} missing; expected {', '.join(self.names)}")

@@ -18,6 +18,7 @@ __all__ = [
     "Frame",
     "FrameSpec",
     "JointSpec",
+    "Loop",
     "LoopSpec",
     "LoopType",
     "MechanismSpec",
@@ -289,6 +290,9 @@ class LoopSpec(FileStruct, frozen=True):
     axis_a: Vector3 = (0.0, 0.0, 1.0)
     axis_b: Vector3 = (0.0, 0.0, 1.0)
     length: Positive | None = None
+
+
+Loop = LoopSpec  # its public name
 
 
 class PointSpec(FileStruct, frozen=True):

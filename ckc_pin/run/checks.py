@@ -6,7 +6,6 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.build import SceneController
 from ckc_pin.control.controllers import (
     Controller,
     SetPoint,
@@ -130,7 +129,7 @@ def run_warnings(scene: Scene) -> list[str]:
     except CkcError:  # The run reports this error itself.
         return mechanism.warnings
     desired = None
-    if scene.spec.controller is not None:
+    if scene.spec.controller is not None or scene.controller is not None:
         desired = check_desired(build_scene_controller(scene, mechanism), mechanism, scene.spec.t_end, start)
     return [
         *mechanism.warnings,
@@ -143,7 +142,7 @@ def start_warnings(scene: Scene, mechanism: Mechanism, start: Start) -> list[str
     """Return warnings of a start outside joint limits, and of a start or target that looks like degrees."""
     units = dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
     angles = {f"initial.q.{name}": x for name, x in scene.spec.initial.q.items() if units.get(name) == "rad"}
-    if isinstance(scene.spec.controller, SetPointSpec):
+    if isinstance(scene.spec.controller, SetPointSpec) and scene.controller is None:
         targets = scene.spec.controller.q_d
         angles |= {f"controller.q_d.{name}": x for name, x in targets.items() if units.get(name) == "rad"}
     degrees = describe_degrees({name: x for name, x in angles.items() if looks_like_degrees(x)})
@@ -151,7 +150,7 @@ def start_warnings(scene: Scene, mechanism: Mechanism, start: Start) -> list[str
 
 
 def check_desired(
-    controller: SceneController | None, mechanism: Mechanism, t_end: float, start: Start | None
+    controller: Controller | TorqueController | None, mechanism: Mechanism, t_end: float, start: Start | None
 ) -> DesiredCheck | None:
     """Follow a controller's desired motion from the start: can the mechanism do it, and how close to singular is it.
 

@@ -22,7 +22,7 @@ from ckc_pin.base.linear_algebra import Factorization, one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import RecordedTorques, Tracking
+from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.desired import Desired, find_rate_jump
 from ckc_pin.control.forces import BodyForce, body_wrenches, force_values, generalized_force
 from ckc_pin.control.joint_servo import JointServo
@@ -36,6 +36,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.motion_forces import MotionForces, collect_forces
 from ckc_pin.run.run import Run, Status
 from ckc_pin.scene.initial import find_start
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES, apply_overrides
 from ckc_pin.scene.parts import (
     build_scene_actuation,
     build_scene_controller,
@@ -43,7 +44,7 @@ from ckc_pin.scene.parts import (
     load_scene_mechanism,
     prescribed_motion,
 )
-from ckc_pin.scene.scene import EXPECTED_OVERRIDES, Scene, apply_overrides, as_scene, make_scene
+from ckc_pin.scene.scene import Scene, as_scene, make_scene
 
 __all__ = ["RecordedJoints", "compute_loop_forces", "compute_recorded_dynamics", "inverse_dynamics"]
 
@@ -167,7 +168,7 @@ def _scene_of(run: Run, overrides: Mapping[str, Any]) -> Scene:
     if any(key.partition(".")[0] == "mechanism" for key in overrides):
         raise InputError("mechanism: a run belongs to its mechanism; give a scene to use another mechanism")
     sources = Sources(run.scene_name, None, run.texts)
-    return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources)
+    return make_scene(apply_overrides(run.scene, overrides), run.scene_name, sources, sources)
 
 
 def _collect_motion(
@@ -243,11 +244,13 @@ def _require_actuated(mechanism: Mechanism, tangent: Array, t: float) -> None:
 def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
     """Yield the desired motion of a scene's controller, with v' = rho q_dot and its rate rho q_ddot + rho_dot q_dot."""
     controller = build_scene_controller(scene, mechanism)
-    if controller is None or isinstance(controller, RecordedTorques | JointServo):
-        name = "torques" if isinstance(controller, RecordedTorques) else "joint_servo"
-        reason = "no [controller]" if controller is None else f'the controller\'s type is "{name}"'
+    if not isinstance(controller, SetPoint | Tracking):
+        kind = scene.spec.controller and scene.spec.controller.__struct_config__.tag
+        what = f'the controller\'s type is "{kind}"'
+        if not isinstance(controller, RecordedTorques | JointServo):
+            what = "no [controller]" if controller is None else "the controller is an object without a desired motion"
         raise InputError(
-            f"{scene.name}: {reason}, so no motion is prescribed; give controller.desired, or a run of the scene"
+            f"{scene.name}: {what}, so no motion is prescribed; give controller.desired, or a run of the scene"
         )
     at = find_start(mechanism, scene).at
     desired = controller.desired if isinstance(controller, Tracking) else _rest_at(controller.q_d)

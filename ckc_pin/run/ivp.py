@@ -27,10 +27,16 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.controllers import Controller, TorqueController, is_torque_controller
+from ckc_pin.control.controllers import (
+    Controller,
+    TorqueController,
+    has_state,
+    initial_state,
+    is_torque_controller,
+)
 from ckc_pin.control.forces import BodyForce, force_values, generalized_force
 from ckc_pin.control.joint_servo import JointServo
-from ckc_pin.control.spec import SampledSpec
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
     dae_acceleration,
@@ -47,6 +53,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.control import apply_u
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.parts import (
+    apply_sampling,
     build_scene_actuation,
     build_scene_controller,
     build_scene_forces,
@@ -114,7 +121,8 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
     """
     scene = as_scene(scene, overrides, "as_ivp")
     spec, mechanism = scene.spec, load_scene_mechanism(scene)
-    if isinstance(spec.controller, SampledSpec) and spec.controller.sample_time is not None:
+    law = build_scene_controller(scene, mechanism)
+    if isinstance(apply_sampling(scene, law), Sampled):
         raise InputError("as_ivp: controller.sample_time: a sampled u is not a function of t and y; remove sample_time")
     smoothing = spec.friction_smoothing
     if mechanism.joints.has_events(smoothing):
@@ -123,10 +131,11 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
             "without stops set friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    controller = build_scene_controller(scene, mechanism)
-    if isinstance(controller, JointServo) and len(controller.initial_state):
-        raise InputError("as_ivp: a controller with an integral has a state beside y; set K_I = 0")
-    force = make_force(controller, build_scene_actuation(scene, mechanism))
+    if has_state(law) and len(initial_state(law)):
+        raise InputError(
+            "as_ivp: a controller with a state of its own is no function of t and y; set K_I = 0 in a servo"
+        )
+    force = make_force(law, build_scene_actuation(scene, mechanism))
     if smoothing is not None:
         force = _with_friction(force, mechanism, smoothing)
     if body_forces := build_scene_forces(scene, mechanism):

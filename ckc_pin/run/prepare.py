@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Protocol
@@ -21,11 +21,10 @@ from ckc_pin.control.controllers import (
     SetPoint,
     TorqueController,
     Tracking,
-    as_controller,
     require_no_memory,
 )
 from ckc_pin.control.desired import Desired
-from ckc_pin.control.forces import BodyForce, Force
+from ckc_pin.control.forces import BodyForce
 from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
@@ -183,10 +182,9 @@ class Prepared:
 
 def prepare(
     scene: Scene,
-    controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
-    events: Sequence[Event] = (),
+    controller: Controller | TorqueController | Sampled | ControlLaw | Mapping[str, Any] | None = None,
+    events: Sequence[Event | Mapping[str, Any]] = (),
     *,
-    forces: Sequence[Force] = (),
     free: bool = False,
     profile: bool = False,
     library: Library | None = None,
@@ -197,12 +195,10 @@ def prepare(
     Parameters
     ----------
     scene : Scene
-    controller : Controller, TorqueController, Sampled or function u(t, terms), optional
+    controller : Controller, TorqueController, Sampled, function u(t, terms) or mapping, optional
         Replaces the scene's controller.
-    events : sequence of Event
+    events : sequence of Event or mapping
         Events in addition to the scene's.
-    forces : sequence of Force
-        Forces in addition to the scene's.
     free : bool
         Use no controller; the caller gives u step by step.
     profile : bool
@@ -221,27 +217,25 @@ def prepare(
     """
     # Too many output instants are refused before anything is loaded.
     instants = np.zeros(0) if free else scene.output_instants()
+    scene = scene.with_control(controller, events)
     mechanism = load_scene_mechanism(scene)
     texts: dict[str, str] = {}
-    if controller is None and not free:
-        controller = apply_sampling(scene, build_scene_controller(scene, mechanism, texts))
-    elif controller is not None and not isinstance(controller, Sampled):
-        controller = as_controller(controller)
+    law = None if free else apply_sampling(scene, build_scene_controller(scene, mechanism, texts))
     actuation = build_scene_actuation(scene, mechanism)
-    body_forces = build_scene_forces(scene, mechanism, forces)
-    functions = build_event_functions(scene.spec.event, events, mechanism)
-    start = require_runnable(scene, mechanism, controller, actuation, free=free)
-    if controller is not None and not isinstance(controller, NATIVE_CONTROLLERS):
+    body_forces = build_scene_forces(scene, mechanism)
+    functions = build_event_functions(scene.spec.event, scene.events, mechanism)
+    start = require_runnable(scene, mechanism, law, actuation, free=free)
+    if law is not None and not isinstance(law, NATIVE_CONTROLLERS):
         v_tree, tree = start.at.rho @ start.q_dot, mechanism.tree
         step = MEMORY_CHECK_STEP * start.at.rho.sum(axis=1) * tree.step_scale
         other = mechanism.kinematics(tree.integrate(start.at.q_tree, step))
         later = MEMORY_CHECK_TIME * scene.spec.t_end
-        require_no_memory(controller, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
+        require_no_memory(law, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
     functions_of_time: list[Any] = [force.over_time for force in body_forces]
-    if not isinstance(controller, Sampled):
-        functions_of_time += [controller, getattr(controller, "desired", None)]
+    if not isinstance(law, Sampled):
+        functions_of_time += [law, getattr(law, "desired", None)]
     if mechanism.prescribed:
         motion = prescribed_motion(scene.spec.prescribed)
         functions_of_time.append(motion)
@@ -253,16 +247,16 @@ def prepare(
     if (breakpoints := breakpoints_table(functions_of_time)) is not None:
         formulation["breakpoints"] = breakpoints
     formulation["works"] = scene.spec.work
-    if isinstance(law := unwrap_sampled(controller), JointServo):
-        law.limit_torques(actuation.limit)
+    if isinstance(servo := unwrap_sampled(law), JointServo):
+        servo.limit_torques(actuation.limit)
     sensitivities = None
     if set_up_sensitivities is not None:
-        sensitivities = set_up_sensitivities(scene, mechanism, controller, actuation, start)
+        sensitivities = set_up_sensitivities(scene, mechanism, law, actuation, start)
         library = sensitivities.parameter_library
         formulation["sensitivities"] = sensitivities.table
     with scene.sources.prefix_errors():
         control = control_table(
-            controller,
+            law,
             actuation,
             partial(wrap_controller, mechanism=mechanism),
             differentiates=sensitivities is not None,
@@ -278,7 +272,7 @@ def prepare(
     return Prepared(
         scene=scene,
         mechanism=mechanism,
-        controller=controller,
+        controller=law,
         actuation=actuation,
         forces=body_forces,
         events=functions,

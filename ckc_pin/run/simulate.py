@@ -11,12 +11,13 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
-from ckc_pin.base.validation import require_callable, require_flag
+from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_callable, require_flag, require_table
 from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.forces import Force
 from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import Loop, StopReason
 from ckc_pin.run.compiled_terms import COMPILE_AFTER_RHS, NEVER, compile_during_run
 from ckc_pin.run.desired_path import find_target
@@ -26,6 +27,7 @@ from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.run import Run, Status
 from ckc_pin.run.run_file import MAX_BYTES
 from ckc_pin.run.stop_reasons import PAUSE_S, add_cause, describe_stop, find_exit
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES
 from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = ["OnOutput", "Progress", "build_run", "record_columns", "record_rows", "run_prepared", "simulate"]
@@ -37,38 +39,42 @@ SCALARS = ("t", "energy", "dissipated", "lyapunov", "max_phi", "max_phi_dot")  #
 
 
 def simulate(
-    scene: Scene | str | Path,
+    scene: Scene | Mechanism | str | Path,
     overrides: Mapping[str, Any] | None = None,
     *,
-    controller: Controller | TorqueController | Sampled | ControlLaw | None = None,
-    events: Sequence[Event] = (),
-    forces: Sequence[Force] = (),
+    controller: Controller | TorqueController | Sampled | ControlLaw | Mapping[str, Any] | None = None,
+    events: Sequence[Event | Mapping[str, Any]] = (),
+    forces: Sequence[Force | Mapping[str, Any]] = (),
     progress: Progress | None = None,
     on_output: OnOutput | None = None,
     profile: bool = False,
+    **keys: Any,
 ) -> Run:
-    """Simulate a scene.
+    """Simulate a scene, or a mechanism.
 
     Parameters
     ----------
-    scene : Scene, str or Path
-        A scene, its shipped name ("five_bar/tracking"), or its path.
+    scene : Scene, Mechanism, str or Path
+        A scene, its shipped name ("five_bar/tracking"), or its path. Or a mechanism with the other arguments of
+        `Scene`, as ``simulate(mechanism, t_end=1.0, initial={"q": [-1.4, -1.9]})``.
     overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
-    controller : Controller, TorqueController, Sampled or function, optional
+    controller : Controller, TorqueController, Sampled, function or mapping, optional
         An object with a method u(t, terms) or tau(t, terms), or a function u(t, terms). u is eq. 6's force on the
         independent coordinates. It replaces the scene's controller with its sample time, delay, sensors and drives;
-        `Sampled` adds others.
-    events : sequence of Event, optional
-        Event functions of the state, in addition to the scene's events.
-    forces : sequence of Force, optional
-        Forces and moments on links, constant or functions of (t, terms), in addition to the scene's.
+        `Sampled` adds others. Or a table with the keys of a scene's [controller].
+    events : sequence of Event or mapping, optional
+        Event functions of the state, and tables with the keys of an [[event]], in addition to the scene's events.
+    forces : sequence of Force or mapping, optional
+        Forces and moments on links, and tables with the keys of a [[force]], in addition to the scene's forces.
     progress : callable, optional
         Called as progress(t, t_end), about every 0.05 s.
     on_output : callable, optional
         Called as on_output(t, q_tree) for each output instant, q_tree by coordinate, shape (n,).
     profile : bool
         Count the terms that are evaluated in `Run.profile`.
+    **keys
+        Keys of a scene, e.g. ``t_end=2.0``, which replace those of the scene.
 
     Returns
     -------
@@ -84,15 +90,38 @@ def simulate(
     KeyboardInterrupt
         The run was interrupted before the first output instant was recorded.
     """
-    scene = as_scene(scene, overrides, "simulate")
+    if overrides is not None:
+        require_table(overrides, "simulate: overrides", EXPECTED_OVERRIDES)
+        if twice := sorted(set(keys) & set(overrides)):
+            raise InputError(f"simulate: {twice[0]} is given twice, as an argument and in overrides")
+    if isinstance(scene, Mechanism):
+        scene = _make_scene(scene, overrides or {}, controller, events, forces, keys)
+    else:
+        scene = as_scene(scene, {**(overrides or {}), **keys}, "simulate").with_control(controller, events, forces)
     require_callable(progress, "simulate: progress", "a function of (t, t_end)")
     require_callable(on_output, "simulate: on_output", "a function of (t, q_tree)")
     require_flag(profile, "simulate: profile")
-    prepared = prepare(scene, controller, events, forces=forces, profile=profile)
-    run = run_prepared(prepared, progress, on_output)
-    if controller is not None:
-        run.scene.pop("controller", None)  # The caller's controller replaced it.
-    return run
+    return run_prepared(prepare(scene, profile=profile), progress, on_output)
+
+
+def _make_scene(
+    mechanism: Mechanism,
+    overrides: Mapping[str, Any],
+    controller: Any,
+    events: Sequence[Any],
+    forces: Sequence[Any],
+    keys: dict[str, Any],
+) -> Scene:
+    """Return the scene of a mechanism and keys. The overrides may have t_end, which has no default."""
+    t_end = keys.pop("t_end", overrides.get("t_end"))
+    if t_end is None:
+        nearest = find_nearest_name("t_end", keys, MIN_SIMILARITY)
+        raise InputError(
+            "simulate: a Mechanism has no end time; give t_end, as simulate(mechanism, t_end=1.0)"
+            + (f", not {nearest}" if nearest else "")
+        )
+    scene = Scene(mechanism, t_end=t_end, controller=controller, events=events, forces=forces, **keys)
+    return scene.with_overrides(overrides)
 
 
 def run_prepared(prepared: Prepared, progress: Progress | None = None, on_output: OnOutput | None = None) -> Run:
@@ -170,11 +199,14 @@ def build_run(
 
 
 def _describe_scene(prepared: Prepared) -> dict[str, Any]:
-    """Return the scene with the caller's forces, without the values of those that are functions of the state."""
-    data = prepared.scene.to_dict()
-    of_caller = prepared.forces[len(prepared.scene.spec.force) :]
-    if of_caller:
-        data["force"] = [*data.get("force", []), *(force.to_dict() for force in of_caller)]
+    """Return the scene's data without a controller object, with the frames of forces that are functions."""
+    scene = prepared.scene
+    data = scene.to_dict()
+    if scene.controller is not None:
+        data.pop("controller", None)  # The caller's controller replaced it.
+    functions = prepared.forces[len(scene.spec.force) :]
+    if functions:
+        data["force"] = [*data.get("force", []), *(force.to_dict() for force in functions)]
     return data
 
 

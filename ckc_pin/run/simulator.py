@@ -24,7 +24,7 @@ from ckc_pin.run.state import State
 from ckc_pin.run.stop_reasons import PAUSE_S, describe_stop
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import build_scene_controller
-from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, describe_formulation, make_scene
+from ckc_pin.scene.scene import Scene, as_scene, describe_formulation
 
 __all__ = ["Simulator"]
 
@@ -41,8 +41,8 @@ class Simulator(HasSummary):
         torque limit and the allocation are used.
     overrides : mapping, optional
         Values by dotted key, e.g. ``{"formulation": "dae", "solver.rtol": 1e-10}``.
-    events : sequence of Event, optional
-        Event functions of the state, in addition to the scene's events.
+    events : sequence of Event or mapping, optional
+        Event functions of the state, and tables with the keys of an [[event]], in addition to the scene's events.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Simulator(HasSummary):
         scene: Scene | str | Path,
         overrides: Mapping[str, Any] | None = None,
         *,
-        events: Sequence[Event] = (),
+        events: Sequence[Event | Mapping[str, Any]] = (),
     ) -> None:
         scene = as_scene(scene, overrides, "Simulator")
         self.scene = scene
@@ -244,9 +244,7 @@ class Simulator(HasSummary):
         """Return the start that a table as a scene's [initial] describes."""
         if not isinstance(table, Mapping):
             raise InputError(f"reset: expected a State or a table as a scene's [initial], got {table!r:.80}")
-        scene = self._prepared.scene
-        data = apply_overrides(scene.to_dict(), {"initial": table})
-        return find_start(self.mechanism, make_scene(data, scene.name, scene.sources))
+        return find_start(self.mechanism, self._prepared.scene.with_overrides({"initial": table}))
 
     def _require_dt(self, dt: Any) -> float:
         if not is_number(dt) or not 0 < dt < math.inf or not self._state.t + dt > self._state.t:

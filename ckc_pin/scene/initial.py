@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +15,10 @@ from ckc_pin.kinematics.sigma import newton, sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
-from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from ckc_pin.scene.scene import Scene
 
 __all__ = ["Start", "find_branch", "find_start", "is_chart", "prescribed_velocity", "require_chart"]
 

@@ -6,27 +6,33 @@ import math
 from collections.abc import Sequence
 from os.path import exists
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ckc_pin.base.sources import Sources
 from ckc_pin.control.actuation import Actuation
-from ckc_pin.control.build import SceneController, make_controller
+from ckc_pin.control.build import make_controller
+from ckc_pin.control.controllers import Controller, TorqueController
 from ckc_pin.control.desired import Desired, find_rate_jump, make_motion
-from ckc_pin.control.forces import BodyForce, Force, read_forces
-from ckc_pin.control.sampled import Sampled
+from ckc_pin.control.forces import BodyForce, read_forces
+from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.control.spec import FeedbackSpec, SampledSpec
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.loading import load
-from ckc_pin.mechanism.library import mechanism_file
+from ckc_pin.kinematics.loading import build, load
+from ckc_pin.mechanism.library import MECHANISM_FILE, mechanism_file
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.scene.initial import find_branch, is_chart
-from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import PrescribedSpec
+
+if TYPE_CHECKING:
+    from ckc_pin.scene.scene import Scene
 
 __all__ = [
     "apply_sampling",
     "build_scene_actuation",
     "build_scene_controller",
     "build_scene_forces",
+    "load_controller_model",
     "load_scene_mechanism",
     "prescribed_motion",
     "prescribed_positions",
@@ -46,9 +52,22 @@ def load_scene_mechanism(scene: Scene) -> Mechanism:
 
 def rebuild_scene_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
     """Load a scene's mechanism with other parameters than the scene's."""
+    positions = prescribed_positions(scene.spec.prescribed)
+    if scene.mechanism_sources is not None:
+        sources = scene.mechanism_sources.with_texts({})
+        return build(sources.text(MECHANISM_FILE), sources, overrides, positions)
     mechanism = scene.spec.mechanism
     name = _resolve_path(scene, mechanism) if isinstance(mechanism, str) else mechanism
-    return load(name, overrides, prescribed_positions(scene.spec.prescribed))
+    return load(name, overrides, positions)
+
+
+def load_controller_model(scene: Scene, name: str) -> Mechanism:
+    """Load the mechanism that a controller of a scene has for its model: from the scene's texts, or by name or path."""
+    texts, prefix = scene.sources.available, name.removesuffix(MECHANISM_FILE)
+    if name not in texts:
+        return load(_resolve_path(scene, name))
+    files = {file.removeprefix(prefix): text for file, text in texts.items() if file.startswith(prefix)}
+    return build(texts[name], Sources(scene.sources.name, None, files))
 
 
 def prescribed_motion(prescribed: Sequence[PrescribedSpec]) -> Desired:
@@ -94,8 +113,8 @@ def _resolve_path(scene: Scene, name: str) -> str | Path:
 
 def build_scene_controller(
     scene: Scene, mechanism: Mechanism, texts: dict[str, str] | None = None
-) -> SceneController | None:
-    """Build a scene's controller.
+) -> Controller | TorqueController | None:
+    """Return a scene's controller, without its sampling: built from the scene's table, or the object that it has.
 
     Parameters
     ----------
@@ -108,12 +127,14 @@ def build_scene_controller(
     """
 
     def load_model(name: str) -> Mechanism:
-        model = load(_resolve_path(scene, name))
+        model = load_controller_model(scene, name)
         if texts is not None:
             texts.update({f"model/{file}": text for file, text in model.sources.texts.items()})
         return model
 
     spec = scene.spec
+    if scene.controller is not None:
+        return unwrap_sampled(scene.controller)
     if spec.controller is None:
         return None
     with scene.sources.prefix_errors():
@@ -134,20 +155,24 @@ def build_scene_actuation(scene: Scene, mechanism: Mechanism) -> Actuation:
         return Actuation(mechanism, spec.torque_limit if spec else None, allocation)
 
 
-def build_scene_forces(scene: Scene, mechanism: Mechanism, forces: Sequence[Force] = ()) -> list[BodyForce]:
-    """Return the forces of a scene, and those of the caller, on the mechanism's bodies.
+def build_scene_forces(scene: Scene, mechanism: Mechanism) -> list[BodyForce]:
+    """Return the forces of a scene on the mechanism's bodies.
 
     Raises
     ------
     InputError, MechanismError
     """
     with scene.sources.prefix_errors():
-        return read_forces(scene.spec.force, forces, mechanism, scene.sources)
+        return read_forces(scene.spec.force, scene.forces, mechanism, scene.sources)
 
 
-def apply_sampling(scene: Scene, controller: SceneController | None) -> SceneController | Sampled | None:
+def apply_sampling(
+    scene: Scene, controller: Controller | TorqueController | None
+) -> Controller | TorqueController | Sampled | None:
     """Return a scene's controller with the scene's sample time, delay, sensors and drives, if it is sampled."""
     spec = scene.spec.controller
+    if scene.controller is not None:
+        return scene.controller
     if controller is None or not isinstance(spec, SampledSpec) or spec.sample_time is None:
         return controller
     with scene.sources.prefix_errors():

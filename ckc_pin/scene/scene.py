@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from copy import deepcopy
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
-from os.path import isdir, isfile
 from pathlib import Path
 from typing import Any
 
@@ -14,50 +12,72 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.sources import Sources
+from ckc_pin.base.sources import Sources, write_texts
 from ckc_pin.base.summary import HasSummary, Row, Summary
-from ckc_pin.base.toml import convert, find_faults, join_dotted_keys, read_text, read_toml
-from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_table, require_type, suggest_name
+from ckc_pin.base.toml import convert, read_text, read_toml
+from ckc_pin.base.toml_writer import to_toml_value
+from ckc_pin.base.validation import (
+    require_path,
+    require_table,
+    require_type,
+)
+from ckc_pin.control.controllers import Controller, TorqueController, as_controller
+from ckc_pin.control.forces import Force, LinkForceSpec
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SampledSpec, SetPointSpec, TorquesSpec, TrackingSpec
 from ckc_pin.errors import InputError
+from ckc_pin.kinematics.loading import as_mechanism
+from ckc_pin.mechanism.files import mechanism_sources
 from ckc_pin.mechanism.library import (
     MECHANISM_FILE,
     GeneratorSpec,
-    describe_mechanism,
-    first_comment,
     is_path,
     library,
-    shipped,
 )
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import ROOTS, is_parameter
+from ckc_pin.scene.arguments import embed_file, embed_files, name_arrays
+from ckc_pin.scene.names import DEFAULT, SUFFIX, describe_scene_name, find_scene_file
+from ckc_pin.scene.overrides import EXPECTED_OVERRIDES, apply_overrides, join_names
+from ckc_pin.scene.parts import load_scene_mechanism
+from ckc_pin.scene.saving import scene_texts
 from ckc_pin.scene.spec import EventSpec, SceneSpec, SolverSpec
 
-__all__ = [
-    "Scene",
-    "SceneSpec",
-    "SolverSpec",
-    "apply_overrides",
-    "as_scene",
-    "describe_formulation",
-    "list_catalogue",
-    "list_scene_names",
-    "load_scene",
-    "to_toml_value",
-]
+__all__ = ["Scene", "SceneSpec", "SolverSpec", "as_scene", "describe_formulation", "load_scene", "make_scene"]
 
-SUFFIX = ".scene.toml"
-DEFAULT = "default"
-TABLES_BY_NAME = (("initial", "q"), ("initial", "q_dot"), ("controller", "q_d"), ("parameters",))  # keys contain dots
-EXPECTED_SCENE = 'a scene: its shipped name, as "five_bar/swing", its path, or what load_scene returns'
-EXPECTED_OVERRIDES = 'a table of values by dotted key, as {"solver.rtol": 1e-10}'
+EXPECTED_SCENE = 'a scene: a Scene, its shipped name, as "five_bar/swing", or its path'
 DEFAULT_OUTPUT_INTERVALS = 500  # where a scene gives no output_dt
 MAX_OUTPUT_INSTANTS = 1_000_000
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False, init=False)
 class Scene(HasSummary):
-    """A checked scene: mechanism, formulation, start, solver, controller and events of a run.
+    """What to run: mechanism, formulation, start, solver, controller and events. `load_scene` reads one from a file.
+
+    Parameters
+    ----------
+    mechanism : Mechanism, str or Path
+        A mechanism, or its name or path as for `load`. Its parameter values become those of the scene.
+    t_end : float
+        End time, s.
+    formulation : "reduced", "dae" or "spf"
+    initial : mapping, optional
+        The keys of [initial]. Default: at rest, as assembled.
+    controller : mapping or object, optional
+        The keys of [controller], or a controller as for `simulate`.
+    events : sequence of mapping or Event, optional
+        Tables with the keys of [[event]], and event functions.
+    forces : sequence of mapping or Force, optional
+        Tables with the keys of [[force]], and forces.
+    name : str, optional
+        Name of the scene and its runs. Default: the mechanism's.
+    **keys
+        Other keys of a scene file: solver, parameters, prescribed, epsilon, spf_coordinates, coriolis_velocity and
+        friction_smoothing.
+
+    Raises
+    ------
+    InputError, MechanismError
+        A wrong argument, an unknown key, or a mechanism that cannot be loaded.
 
     Attributes
     ----------
@@ -66,12 +86,176 @@ class Scene(HasSummary):
     name : str
         The name or path that the user gave.
     sources : Sources
-        Where the files that the scene names are found: mechanism, trajectories, controller models.
+        Where the files that the scene names are found: trajectories, controller models and, of a scene file, the
+        mechanism.
+    mechanism_sources : Sources or None
+        The mechanism's files, of a scene made in Python.
+    controller : Controller, TorqueController, Sampled or None
+        A controller that is an object of Python, instead of one that `spec` describes.
+    events : tuple of Event
+        Event functions in addition to the events of `spec`.
+    forces : tuple of Force
+        Forces that are functions of the state, in addition to those of `spec`.
+
+    Notes
+    -----
+    Wherever a table by coordinate or motor is taken, an array may stand for it, in the order of `independent` or
+    `actuated`; `q` of `initial` may also have all coordinates. The `model` of a controller may be a mechanism. Each
+    `file` is a path relative to the working directory, or a table of columns, such as a DataFrame.
+
+    Examples
+    --------
+    >>> drive = {"type": "set_point", "K_P": 10.0, "K_V": 1.0, "q_d": [-1.0, -2.0]}
+    >>> scene = Scene("five_bar", t_end=1.0, initial={"q": [-1.4, -1.9]}, controller=drive)
+    >>> run = simulate(scene)
     """
 
     spec: SceneSpec
     name: str
     sources: Sources
+    mechanism_sources: Sources | None
+    controller: Controller | TorqueController | Sampled | None
+    events: tuple[Any, ...]
+    forces: tuple[Force, ...]
+
+    def __init__(
+        self,
+        mechanism: Mechanism | str | Path,
+        *,
+        t_end: float,
+        formulation: str = "reduced",
+        initial: Mapping[str, Any] | None = None,
+        controller: Any = None,
+        events: Sequence[Any] = (),
+        forces: Sequence[Any] = (),
+        name: str | None = None,
+        **keys: Any,
+    ) -> None:
+        mechanism = as_mechanism(mechanism, "Scene")
+        if mechanism.prescribed:
+            raise InputError(
+                f"Scene: mechanism: its joints {', '.join(mechanism.prescribed)} are held at a position; give it "
+                "without them, and their motion as prescribed"
+            )
+        for key, argument in (("event", "events"), ("force", "forces")):
+            if key in keys:
+                raise InputError(f"Scene: {key}: the argument is called {argument}")
+        start = to_toml_value({} if initial is None else initial)
+        if isinstance(start, Mapping) and not {"q", "at"} & set(start):
+            start = {"at": "assembled", **start}
+        data = to_toml_value(
+            {"mechanism": MECHANISM_FILE, "formulation": formulation, "t_end": t_end, "initial": start, **keys}
+        )
+        if mechanism.overrides and isinstance(data.get("parameters", {}), Mapping):
+            data["parameters"] = {**to_toml_value(mechanism.overrides), **data.get("parameters", {})}
+        if name is not None:
+            require_type(name, str, "Scene: name", "a string")
+        scene = make_scene(data, name or mechanism.name, Sources("Scene", None), mechanism_sources(mechanism))
+        self.__dict__.update(scene.with_control(controller, events, forces).__dict__)
+
+    def with_overrides(self, overrides: Mapping[str, Any] | None) -> Scene:
+        """Return the scene with values replaced by dotted key, as in `load_scene`.
+
+        Raises
+        ------
+        InputError
+            An unknown key, or a wrong type or value.
+        """
+        if not overrides:
+            return self
+        data = apply_overrides(self.to_dict(), overrides)
+        is_other_mechanism = any(key.partition(".")[0] == "mechanism" for key in overrides)
+        scene = make_scene(data, self.name, self.sources, None if is_other_mechanism else self.mechanism_sources)
+        controller = None if "controller" in overrides else self.controller
+        return _create(scene, events=self.events, forces=self.forces, controller=controller)
+
+    def with_control(self, controller: Any, events: Sequence[Any], forces: Sequence[Any] = ()) -> Scene:
+        """Return the scene with another controller, and with further events and forces.
+
+        Parameters
+        ----------
+        controller : mapping, object or None
+            A table replaces the scene's controller. An object acts instead of it, within its torque limits. None keeps
+            the scene's controller.
+        events : sequence of mapping or Event
+        forces : sequence of mapping or Force
+
+        Raises
+        ------
+        InputError
+            A controller or a table that is not valid.
+        """
+        require_type(events, (list, tuple), "events", "a list of Event objects and of tables as a scene's [[event]]")
+        require_type(forces, (list, tuple), "forces", "a list of Force objects and of tables as a scene's [[force]]")
+        if controller is None and not events and not forces:
+            return self
+        source, scene = self.sources.name, self
+        overrides: dict[str, Any] = {}
+        if isinstance(controller, Mapping | msgspec.Struct):
+            table, texts = to_toml_value(controller), dict(self.sources.available)
+            embed_files(table, texts, reads_paths=self.sources.folder is None)
+            overrides["controller"], scene = table, _create(self, sources=self.sources.with_texts(texts))
+        elif controller is not None:
+            law = controller if isinstance(controller, Sampled) else as_controller(controller)
+            scene = _create(self, controller=law)
+        tables = [to_toml_value(event) for event in events if isinstance(event, Mapping | msgspec.Struct)]
+        if tables:
+            convert(tables, list[EventSpec], source, "events")
+            overrides["event"] = [*scene.to_dict()["event"], *tables]
+        functions = tuple(event for event in events if not isinstance(event, Mapping | msgspec.Struct))
+        scene = _create(scene.with_overrides(overrides), events=(*self.events, *functions))
+        return scene._with_forces(forces) if forces else scene
+
+    def _with_forces(self, forces: Sequence[Any]) -> Scene:
+        """Return the scene with further forces; those with constant values become tables."""
+        texts, tables, functions = dict(self.sources.available), [], []
+        for k, force in enumerate(forces):
+            if isinstance(force, Force):
+                spec = force.as_spec()
+                tables += [] if spec is None else [to_toml_value(spec)]
+                functions += [force] if spec is None else []
+                continue
+            require_type(force, (Mapping, msgspec.Struct), f"forces[{k}]", "a Force, or a table as a scene's [[force]]")
+            table = to_toml_value(force)
+            embed_file(table, f"force_{k}.csv", texts, f"forces[{k}].file", reads_paths=self.sources.folder is None)
+            tables.append(table)
+        convert(tables, list[LinkForceSpec], self.sources.name, "forces")
+        scene = _create(self, sources=self.sources.with_texts(texts), forces=(*self.forces, *functions))
+        return scene.with_overrides({"force": [*scene.to_dict()["force"], *tables]}) if tables else scene
+
+    def save(self, folder: str | Path, name: str = DEFAULT, *, overwrite: bool = False) -> Path:
+        """Write the scene and all its files into a folder, so that ``ckc run`` does the same.
+
+        The files are NAME.scene.toml, mechanism.toml with its URDFs, CSV files, and the folder ``model`` of the
+        controller's own model. Mesh files are not copied; playback takes their folder as ``meshes``.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Created if it does not exist.
+        name : str
+            Of the scene in its file's name.
+        overwrite : bool
+            Whether existing files may be replaced.
+
+        Returns
+        -------
+        Path
+            Of the scene file.
+
+        Raises
+        ------
+        InputError
+            A file exists already, the folder cannot be written to, or the scene's controller or an event is an object
+            of Python.
+        """
+        require_path(folder, "Scene.save: folder")
+        require_type(name, str, "Scene.save: name", "a string")
+        if Path(name).name != name:
+            raise InputError(f"Scene.save: name = {name!r:.80}: expected a file name without {SUFFIX}")
+        file = f"{name}{SUFFIX}"
+        write_texts(Path(folder), scene_texts(self, file), overwrite)
+        return Path(folder) / file
 
     def summary(self) -> Summary:
         """Return a one-screen summary: mechanism, formulation, start, method, control and events."""
@@ -79,6 +263,8 @@ class Scene(HasSummary):
         mechanism, start = spec.mechanism, spec.initial.at
         if isinstance(mechanism, GeneratorSpec):
             mechanism = f"{mechanism.generator}, N = {mechanism.N}"
+        if self.mechanism_sources is not None:
+            mechanism = self.mechanism_sources.name
         q = [f"{name} = {value:g}" for name, value in spec.initial.q.items()]
         rows: list[Row] = [
             ("mechanism", mechanism),
@@ -89,10 +275,12 @@ class Scene(HasSummary):
         rates = [f"{name} = {value:g}" for name, value in spec.initial.q_dot.items() if value]
         rows += [("with rates", rates)] if rates else []
         rows.append(("method", f"{spec.solver.method}, rtol = {spec.solver.rtol:g}"))
-        rows.append(("control", _describe_controller(spec.controller)))
-        forces = [f"on {force.name or force.frame}" for force in spec.force]
-        rows += [("forces", forces)] if forces else []
+        is_object = self.controller is not None
+        rows.append(("control", type(self.controller).__name__ if is_object else _describe_controller(spec.controller)))
+        rows += [("force", f"on {force.name or force.frame}") for force in spec.force]
+        rows += [("force", f"on {force.name or force.frame}, a function of the state") for force in self.forces]
         rows += [("event", f"{event.of} of {event.coordinate or 'the mechanism'}") for event in spec.event]
+        rows += [("event", "a function of the state") for _ in self.events]
         return Summary(f"Scene {self.name}", rows)
 
     def to_dict(self) -> dict[str, Any]:
@@ -106,7 +294,7 @@ class Scene(HasSummary):
 
     def refuse_forces(self, function: str) -> None:
         """Raise InputError if the scene has forces on links, for a function that does not support them."""
-        if self.spec.force:
+        if self.spec.force or self.forces:
             raise InputError(f"{function}: forces on links are not supported; remove [[force]]")
 
     def output_instants(self) -> Array:
@@ -173,52 +361,6 @@ def describe_formulation(scene: dict[str, Any], *, exact: bool) -> str:
     return f"spf in (q, q_dot, {coordinates}), epsilon = {scene['epsilon']:g}{same}"
 
 
-def list_scene_names(mechanism: str) -> list[str]:
-    """Return the names of a shipped mechanism's scenes."""
-    return sorted(p.name.removesuffix(SUFFIX) for p in (library() / mechanism).glob(f"*{SUFFIX}"))
-
-
-def find_scene_file(name: str | Path) -> Path:
-    """Return the path of a scene given as MECHANISM, MECHANISM/SCENE, a path, or a path without ``.scene.toml``.
-
-    Raises
-    ------
-    InputError
-        There is no such scene. The message lists the existing ones.
-    """
-    if isinstance(name, Path) or is_path(name):
-        path = Path(name)
-        if isdir(path) or path.name == MECHANISM_FILE:
-            path = _find_default(path if isdir(path) else path.parent)
-        return path
-    if isfile(f"{name}{SUFFIX}"):
-        return Path(f"{name}{SUFFIX}")
-    mechanism, _, scene = name.partition("/")
-    path = library() / mechanism / f"{scene or DEFAULT}{SUFFIX}"
-    if Path(name).parts in ((mechanism,), (mechanism, scene)) and isfile(path):
-        return path
-    if mechanism not in shipped():
-        raise InputError(
-            f"no mechanism {mechanism!r}; shipped: {', '.join(shipped())}; or give the path of a *{SUFFIX} file"
-        )
-    raise InputError(f"{mechanism} has no scene {scene!r}; it has {', '.join(list_scene_names(mechanism))}")
-
-
-def _find_default(folder: Path) -> Path:
-    """Return a folder's default scene, or its only one."""
-    path = folder / f"{DEFAULT}{SUFFIX}"
-    others = sorted(p.name for p in folder.glob(f"*{SUFFIX}"))
-    if isfile(path):
-        return path
-    if len(others) == 1:
-        return folder / others[0]
-    if others:
-        raise InputError(f"{folder}: no {path.name}; name one of its scenes: {', '.join(others)}")
-    if isfile(folder / "run.npz"):
-        raise InputError(f"{folder}: a finished run, not a scene; ckc play, plot and inverse accept this folder")
-    raise InputError(f"{folder}: it contains no scene, *{SUFFIX}; ckc new NAME makes a folder with an example")
-
-
 def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     """Load a scene by shipped name or path.
 
@@ -245,32 +387,26 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     path = find_scene_file(name)
     source = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), source)
-    return make_scene(apply_overrides(data, overrides or {}), _display_name(name, path), Sources(source, path.parent))
-
-
-def _display_name(name: str | Path, path: Path) -> str:
-    """Return the user's name for a scene, or FOLDER/SCENE if the user gave a folder."""
-    if not isdir(name):
-        return str(name)
-    scene = path.name.removesuffix(SUFFIX)
-    return path.parent.resolve().name + ("" if scene == DEFAULT else f"/{scene}")
+    return make_scene(
+        apply_overrides(data, overrides or {}), describe_scene_name(name, path), Sources(source, path.parent)
+    )
 
 
 def as_scene(scene: Any, overrides: Mapping[str, Any] | None, caller: str) -> Scene:
-    """Return a public function's scene argument as a `Scene`: unchanged, or loaded by name or path.
+    """Return a public function's scene argument as a `Scene`: itself, or loaded by name or path, with overrides.
 
     Parameters
     ----------
     scene : Scene, str or Path
     overrides : mapping or None
-        Values by dotted key. They are accepted only with a name or path.
+        Values by dotted key.
     caller : str
         The public function, for messages.
 
     Raises
     ------
     InputError, MechanismError
-        Another type, overrides beside a `Scene`, or an error of `load_scene`.
+        Another type, or an error of `load_scene`.
     """
     if isinstance(scene, Mechanism):
         folder = scene.sources.folder
@@ -278,28 +414,48 @@ def as_scene(scene: Any, overrides: Mapping[str, Any] | None, caller: str) -> Sc
         is_shipped = folder is not None and folder.parent == library()
         examples = ", ".join(f"{folder.name}/{name}" if is_shipped and folder else f"{name}{SUFFIX}" for name in names)
         raise InputError(
-            f"{caller}: expected {EXPECTED_SCENE}; got a Mechanism, which has no start and no end time"
-            + (f"; scenes of {scene.name}: {examples}" if examples else "")
+            f"{caller}: expected {EXPECTED_SCENE}; got a Mechanism, which has no start and no end time; make a scene "
+            "of it, ckc_pin.Scene(mechanism, t_end=1.0)" + (f"; scenes of {scene.name}: {examples}" if examples else "")
         )
     require_type(scene, (Scene, str, Path), f"{caller}: scene", EXPECTED_SCENE)
     if overrides is not None:
         require_table(overrides, f"{caller}: overrides", EXPECTED_OVERRIDES)
-    if not isinstance(scene, Scene):
-        return load_scene(scene, overrides)
-    if overrides:
-        raise InputError(f"{caller}: overrides are accepted only with the name or path of a scene, not with a Scene")
-    return scene
+    return scene.with_overrides(overrides) if isinstance(scene, Scene) else load_scene(scene, overrides)
 
 
-def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
+def make_scene(data: dict[str, Any], name: str, sources: Sources, plant_sources: Sources | None = None) -> Scene:
     """Return a scene of parsed data, checked for types by msgspec and then for keys that exclude or need each other.
+
+    Parameters
+    ----------
+    data : dict
+        The keys of a scene file. It is changed: lists become tables by coordinate or motor.
+    name : str
+        Name of the scene.
+    sources : Sources
+        The files that it names.
+    plant_sources : Sources, optional
+        The mechanism's files, if they are not found by the key `mechanism`.
 
     Raises
     ------
     InputError
+        An invalid scene.
+    MechanismError
+        There are lists, and the mechanism, whose coordinates they are of, cannot be loaded.
     """
-    for table in TABLES_BY_NAME:
-        join_dotted_keys(data, *table)
+
+    def load() -> Mechanism:
+        part = {key: data[key] for key in ("mechanism", "parameters", "prescribed") if key in data}
+        spec = convert({**part, "formulation": "dae", "t_end": 1.0}, SceneSpec, sources.name)
+        return load_scene_mechanism(_create(spec=spec, name=name, sources=sources, mechanism_sources=plant_sources))
+
+    join_names(data)
+    if isinstance(data.get("controller"), dict):
+        texts: dict[str, str] = {}
+        embed_files(data["controller"], texts, reads_paths=False)
+        sources = sources.with_texts(texts) if texts else sources
+    name_arrays(data, load, sources.name)
     spec = convert(data, SceneSpec, sources.name)
     if spec.initial.at is not None and spec.initial.q:
         raise InputError(f'{sources.name}: initial: give either at = "{spec.initial.at}" or q, not both')
@@ -324,7 +480,20 @@ def make_scene(data: dict[str, Any], name: str, sources: Sources) -> Scene:
     min_step, max_step = spec.solver.min_step, spec.solver.max_step
     if max_step is not None and min_step > max_step:
         raise InputError(f"{sources.name}: solver: min_step = {min_step:g} is above max_step = {max_step:g}")
-    return Scene(spec, name, sources)
+    return _create(spec=spec, name=name, sources=sources, mechanism_sources=plant_sources)
+
+
+def _create(scene: Scene | None = None, **attributes: Any) -> Scene:
+    """Return a scene with these attributes. The others are those of `scene`, or absent."""
+    names = [field.name for field in fields(Scene)]  # without cached properties
+    defaults = (
+        {"controller": None, "events": (), "forces": ()}
+        if scene is None
+        else {name: getattr(scene, name) for name in names}
+    )
+    new = object.__new__(Scene)
+    new.__dict__.update({**defaults, **attributes})
+    return new
 
 
 def _check_event(event: EventSpec, where: str) -> None:
@@ -340,121 +509,8 @@ def _check_event(event: EventSpec, where: str) -> None:
         raise InputError(f"{where}: of = {event.of!r} needs a value greater than 0, because singular values are >= 0")
 
 
-def apply_overrides(data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of a scene's data with values replaced by dotted key; None removes a key.
-
-    The name of a mechanism parameter, as ``link.rod.mass``, stands for its entry in the table ``parameters``. Names of
-    parameters and coordinates may contain dots.
-    """
-    result = deepcopy(data)
-    for path in TABLES_BY_NAME:
-        join_dotted_keys(result, *path)
-    for key, value in overrides.items():
-        _check_root(key)
-        *tables, last = _split_key(f"parameters.{key}" if is_parameter(key) else key)
-        if value is None:
-            _remove_key(result, key, tables, last)
-            continue
-        target = result
-        for k, table in enumerate(tables):
-            target = target.setdefault(table, {})
-            if not isinstance(target, dict):
-                raise InputError(f"{key}: {'.'.join(tables[: k + 1])} is a value, not a table")
-        target[last] = to_toml_value(value)
-    return result
-
-
-def _remove_key(data: dict[str, Any], key: str, tables: list[str], last: str) -> None:
-    """Remove a key from a scene's data, in place. A key that a scene may have and this one has not is no error.
-
-    Raises
-    ------
-    InputError
-        No scene has such a key, or the scene's table of names has no such entry.
-    """
-    target: Any = data
-    for table in tables:
-        target = target.get(table) if isinstance(target, dict) else None
-    if isinstance(target, dict) and last in target:
-        del target[last]
-        return
-    where = ".".join(tables)
-    if tuple(tables) in TABLES_BY_NAME:
-        names = ", ".join(target or {}) or "nothing"
-        raise InputError(
-            f"{key}: the scene has no such entry to remove; {where} has {names}{suggest_name(last, target or {})}"
-        )
-    probe: dict[str, Any] = deepcopy(data)
-    inner = probe
-    for table in tables:
-        inner[table] = inner.get(table) if isinstance(inner.get(table), dict) else {}
-        inner = inner[table]
-    inner[last] = None
-    for fault in find_faults(probe, SceneSpec):
-        *path, name = [*fault.path, fault.value]
-        if fault.kind == "unknown key" and [*tables, last][: len(path) + 1] == [*path, name]:
-            raise InputError(f"{key}: a scene has no such key to remove: {fault.sentence()}")
-
-
-def _check_root(key: str) -> None:
-    """Raise InputError if a key begins almost like the name of a mechanism parameter, and not like a scene's key."""
-    root, keys = key.partition(".")[0], SceneSpec.__struct_fields__
-    if root in keys or is_parameter(key):
-        return
-    nearest = find_nearest_name(root, [*keys, *ROOTS], MIN_SIMILARITY)
-    if nearest in ROOTS:
-        raise InputError(
-            f"{key}: neither a key of a scene nor a parameter of a mechanism, which begins with {', '.join(ROOTS)}"
-            f"{suggest_name(key, [nearest + key.removeprefix(root)])}"
-        )
-
-
-def _split_key(key: str) -> list[str]:
-    """Split a dotted key into tables and key. Names in `TABLES_BY_NAME` keep their dots."""
-    for path in TABLES_BY_NAME:
-        start = ".".join([*path, ""])
-        if key.startswith(start):
-            return [*path, key.removeprefix(start)]
-    return key.split(".")
-
-
-def to_toml_value(value: Any) -> Any:
-    """Return a Python value in the types that TOML has: NumPy scalars and arrays become numbers and lists."""
-    if isinstance(value, Mapping):
-        return {key: to_toml_value(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_toml_value(inner) for inner in value]
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
-
-
 def _drop_absent(value: Any) -> Any:
     """Remove keys whose value is None, at every depth."""
     if isinstance(value, dict):
         return {key: _drop_absent(x) for key, x in value.items() if x is not None}
     return [_drop_absent(x) for x in value] if isinstance(value, list | tuple) else value
-
-
-def list_catalogue() -> list[tuple[str, str, dict[str, str]]]:
-    """Return (name, description, {scene: description}) of each shipped mechanism.
-
-    The description is the first comment of the file, so that it is kept in one place.
-    """
-    return [
-        (
-            name,
-            describe_mechanism(name),
-            {scene: first_comment(_read_scene(name, scene)) for scene in list_scene_names(name)},
-        )
-        for name in shipped()
-    ]
-
-
-def _read_scene(mechanism: str, scene: str) -> str:
-    return read_text(library() / mechanism / f"{scene}{SUFFIX}", "scene")
-
-
-def is_scene_name(name: str) -> bool:
-    """Whether a name or path denotes a scene, not a mechanism."""
-    if is_path(name):
-        return name.endswith(SUFFIX)
-    return "/" in name or isfile(f"{name}{SUFFIX}")

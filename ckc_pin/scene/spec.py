@@ -32,10 +32,12 @@ class InitialSpec(FileStruct, frozen=True):
         configuration assembled from ``q_guess``.
         ``at = "equilibrium"``
     q : rad, m
-        Values of the independent coordinates. Dependent ones may be added to select the assembly branch.
+        Values of the independent coordinates. Dependent ones may be added to select the assembly branch. A list is in
+        the order of ``independent``, or has all coordinates.
         ``q = {theta_1 = -1.2, theta_3 = -1.9}``
     q_dot : rad/s, m/s
         Rates of the independent coordinates; default 0. A free root has velocity and angular velocity in its own axes.
+        A list is in the order of ``independent``.
         ``q_dot = {theta_1 = 0.4}``
     w : m, rad
         Initial residual φ of the loop closures, by row; SPF only; default 0.

@@ -14,10 +14,9 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.base.interrupt import interrupt_again
 from ckc_pin.base.summary import HasSummary, Summary, format_eigenvalues, to_pairs
 from ckc_pin.base.validation import describe_value, is_number, require_path
-from ckc_pin.control.build import SceneController
-from ckc_pin.control.controllers import RecordedTorques, Tracking
+from ckc_pin.control.controllers import Controller, RecordedTorques, TorqueController, Tracking
 from ckc_pin.control.point_path import PointPath
-from ckc_pin.control.spec import FeedbackSpec
+from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -25,8 +24,8 @@ from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import Progress, simulate
 from ckc_pin.scene.initial import find_start
-from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
-from ckc_pin.scene.scene import Scene, apply_overrides, as_scene, make_scene
+from ckc_pin.scene.parts import apply_sampling, build_scene_controller, load_scene_mechanism
+from ckc_pin.scene.scene import Scene, as_scene
 from ckc_pin.sensitivity.parameters import sensitivity_setup
 from ckc_pin.sensitivity.sensitivities import sensitivities
 
@@ -161,8 +160,7 @@ def floquet(
         The run stops before the end of the period.
     """
     period = _require_period(period)
-    base = as_scene(scene, overrides, "floquet")
-    scene = make_scene(apply_overrides(base.to_dict(), {"t_end": period}), base.name, base.sources)
+    scene = as_scene(scene, overrides, "floquet").with_overrides({"t_end": period})
     mechanism = load_scene_mechanism(scene)
     mechanism.refuse_prescribed_joints("floquet")
     if root := mechanism.independent_root_coordinates:
@@ -170,9 +168,11 @@ def floquet(
             f"{mechanism.name}: the independent coordinate {root[0]!r} belongs to a free root, whose rotation has no "
             "monodromy matrix; choose other independent coordinates, or fix the root"
         )
-    if isinstance(scene.spec.controller, FeedbackSpec) and scene.spec.controller.sample_time is not None:
-        _require_whole_samples(scene.spec.controller, scene.spec.controller.sample_time, period, scene.name)
-    if (drive := _find_drive(build_scene_controller(scene, mechanism), mechanism)) is not None:
+    law = build_scene_controller(scene, mechanism)
+    sampled = apply_sampling(scene, law)
+    if isinstance(sampled, Sampled):
+        _require_whole_samples(sampled, period, scene.name)
+    if (drive := _find_drive(law, mechanism)) is not None:
         _require_periodic_drive(drive, period)
     if scene.spec.initial.at is not None:
         scene = _start_from_coordinates(scene, mechanism)
@@ -238,7 +238,7 @@ class _Drive(NamedTuple):
     is_angle: BoolArray
 
 
-def _find_drive(law: SceneController | None, mechanism: Mechanism) -> _Drive | None:
+def _find_drive(law: Controller | TorqueController | None, mechanism: Mechanism) -> _Drive | None:
     if isinstance(law, RecordedTorques):
         rest = Terms(mechanism, mechanism.assembled, np.zeros(mechanism.n))
         return _Drive("the torque over time", lambda t: law.tau(t, rest), float(law.times[-1]), np.zeros(0, bool))
@@ -251,7 +251,7 @@ def _find_drive(law: SceneController | None, mechanism: Mechanism) -> _Drive | N
     return _Drive("the desired motion", lambda t: np.concatenate(desired(t)[:2]), end, is_angle)
 
 
-def _require_whole_samples(controller: FeedbackSpec, sample_time: float, period: float, name: str) -> None:
+def _require_whole_samples(controller: Sampled, period: float, name: str) -> None:
     """Refuse a sampled controller whose state is not the same after a period (InputError)."""
     if controller.delay > 0:
         raise InputError(
@@ -259,7 +259,7 @@ def _require_whole_samples(controller: FeedbackSpec, sample_time: float, period:
             "and the monodromy matrix is that of q and q_dot; remove the delay, or use check, which analyses the "
             "sampled loop"
         )
-    samples = period / sample_time
+    samples = period / controller.sample_time
     if not abs(samples - max(1.0, round(samples))) <= CLOCK_TOLERANCE * samples:
         raise InputError(
             f"{name}: controller.sample_time: period = {period:.9g} s is {samples:.9g} samples; it must be a whole "
@@ -293,7 +293,7 @@ def _start_from_coordinates(scene: Scene, mechanism: Mechanism) -> Scene:
     start = find_start(mechanism, scene)
     q = mechanism.tree.named(mechanism.tree.to_coordinates(start.at.q_tree))
     overrides = {"initial": {"q": q, "q_dot": scene.spec.initial.q_dot}}
-    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)
+    return scene.with_overrides(overrides)
 
 
 def _require_return(run: Run, period: float) -> float:

@@ -39,6 +39,7 @@ from ckc_pin.mechanism.parameters import (
     values_of,
     with_components,
 )
+from ckc_pin.native.control import law_table
 from ckc_pin.native.sensitivity_tables import (
     ParameterDerivative,
     SensitivityParameter,
@@ -312,11 +313,13 @@ def _mechanism_parameter(
 
 def _controller_parameters(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[SensitivityParameter]:
     """Yield the gains, as one number and by diagonal entry, and the target of eq. 14."""
-    spec, unit = scene.spec.controller, np.eye(mechanism.d)
+    spec, unit = None if scene.controller is not None else scene.spec.controller, np.eye(mechanism.d)
+    if not isinstance(controller, SetPoint | Tracking) or law_table(controller) is None:
+        return  # derivatives with respect to the gains of a controller in Python are unknown
     gains = {"K_P": "gain_q", "K_V": "gain_q_dot"} if type(controller) is SetPoint else {}
     gains = {"Lambda": "gain_q", "K_D": "gain_q_dot"} if type(controller) is Tracking else gains
     for key, kind in gains.items():
-        derivatives = {f"controller.{key}": unit} if isinstance(getattr(spec, key), float | int) else {}
+        derivatives = {f"controller.{key}": unit} if isinstance(getattr(spec, key, None), float | int) else {}
         derivatives |= {f"controller.{key}.{name}": np.diag(unit[k]) for k, name in enumerate(mechanism.independent)}
         for name, gain in derivatives.items():
             yield SensitivityParameter(name, (ParameterDerivative(kind, 0, gain.ravel(order="F")),))

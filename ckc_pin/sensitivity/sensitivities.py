@@ -200,8 +200,8 @@ def sensitivities(
     overrides: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     *,
-    controller: Controller | Sampled | ControlLaw | None = None,
-    events: Sequence[Event] = (),
+    controller: Controller | Sampled | ControlLaw | Mapping[str, Any] | None = None,
+    events: Sequence[Event | Mapping[str, Any]] = (),
 ) -> Sensitivities:
     """Run a scene and compute the derivatives of its motion with respect to parameters.
 
@@ -224,10 +224,10 @@ def sensitivities(
         As in `simulate`.
     progress : callable, optional
         As in `simulate`.
-    controller : Controller, Sampled or function, optional
+    controller : Controller, Sampled, function or mapping, optional
         As in `simulate`; it must give u. It is differentiated by central differences, with 4 n calls for each
         right-hand side or sample.
-    events : sequence of Event, optional
+    events : sequence of Event or mapping, optional
         As in `simulate`.
 
     Returns

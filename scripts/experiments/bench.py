@@ -24,8 +24,8 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.run.prepare import Prepared, prepare
 from ckc_pin.run.simulate import run_prepared
+from ckc_pin.scene.names import list_catalogue
 from ckc_pin.scene.parts import build_scene_controller
-from ckc_pin.scene.scene import list_catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 INERT = [{"coordinate": "theta_1", "value": 50.0}]

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from ckc_pin import InputError, as_ivp, load, simulate
 from ckc_pin.analysis.precision.motion import FORMULATIONS
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.scene.scene import list_catalogue
+from ckc_pin.scene.names import list_catalogue
 
 REFERENCE_RTOL = 1e-11
 MAX_ERROR = 100  # largest error of a run over its tolerance

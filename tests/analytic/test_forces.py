@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ckc_pin
-from ckc_pin import Force, InputError, Run, Simulator, inverse_dynamics, simulate
+from ckc_pin import Force, InputError, Run, Simulator, inverse_dynamics, load, simulate
 from ckc_pin.errors import CkcError
 from ckc_pin.native import _core
 from ckc_pin.run.prepare import prepare
@@ -285,6 +285,27 @@ def test_as_ivp_has_the_forces() -> None:
     solution = solve_ivp(problem.f, (0.0, 1.5), problem.y0, "DOP853", rtol=1e-11, atol=1e-13)
     run = simulate("five_bar/swing", scene(force=[WORLD, FOLLOWER]))
     assert_close(problem.terms(1.5, solution.y[:, -1]).q_tree, run.q_tree[-1], 1e-8)
+
+
+def test_forces_of_a_scene_in_python_are_those_of_its_saved_files(tmp_path: Path) -> None:
+    """Tables, columns, constant forces and functions; all but functions can be saved."""
+    columns = {"t": [0.0, 0.4, 0.9], "fx": [0.0, 0.5, -0.3]}
+    forces = [WORLD, Force(FOLLOWER["frame"], FOLLOWER["force"], FOLLOWER["moment"], "frame"),
+              {"frame": "link_1", "file": columns, "interpolation": "linear"}]  # fmt: skip
+    made = ckc_pin.Scene("five_bar", t_end=1.0, initial={"q": START}, forces=forces)
+    run, saved = simulate(made), simulate(made.save(tmp_path))
+    assert np.array_equal(run.q_tree, saved.q_tree)
+    assert run.force_values is not None
+    assert_close(run.force_values[run.t == 0.2, 12], 0.25, 1e-12)
+    direct = simulate(load("five_bar"), t_end=1.0, initial={"q": START}, forces=forces)
+    assert np.array_equal(direct.q_tree, run.q_tree)
+    function = ckc_pin.Scene("five_bar", t_end=1.0, forces=[Force("link_2", lambda t, terms: [t, 0.0, 0.0])])
+    with pytest.raises(InputError, match="the scene's force, a function of the state"):
+        function.save(tmp_path / "function")
+    with pytest.raises(InputError, match="the argument is called forces"):
+        ckc_pin.Scene("five_bar", t_end=1.0, force=[WORLD])
+    with pytest.raises(InputError, match=r"forces\[0\]: expected a Force, or a table"):
+        simulate("five_bar/swing", forces=[3])  # type: ignore[list-item]
 
 
 def test_a_scene_without_forces_costs_what_it_did() -> None:

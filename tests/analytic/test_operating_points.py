@@ -70,7 +70,7 @@ def test_times_of_mechanisms_and_of_stopped_runs_are_rejected() -> None:
         linearize("five_bar/swing", 1.9, {"event": [event]})
 
 
-@pytest.mark.parametrize("at", [np.zeros(2), [1.0, 2.0], 10**400, float("inf"), True, None, "2.0"])
+@pytest.mark.parametrize("at", [np.array(0.5), 10**400, float("inf"), True, None, "2.0"])
 def test_an_argument_that_is_not_a_state_is_rejected(at: Any) -> None:
     with pytest.raises(InputError, match=r"give \"equilibrium\", \"assembled\", \"target\", a time"):
         linearize("five_bar/swing", at)

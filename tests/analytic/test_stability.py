@@ -15,8 +15,8 @@ from ckc_pin.linear.closed_loop import ClosedLoop
 from ckc_pin.linear.stability import stability
 from ckc_pin.mechanism import Mechanism
 from ckc_pin.mechanism.library import shipped
+from ckc_pin.scene.names import list_scene_names
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
-from ckc_pin.scene.scene import list_scene_names
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step, set_point
 
 TRACKING = ["five_bar/tracking", "stewart/wave", "delta/circle", "two_ur5/lift", "three_rrr/circle"]

@@ -79,7 +79,11 @@ START = [
     _value("initial.at=rest", "initial.at = 'rest'; valid: 'assembled', 'equilibrium'"),
     _value("initial.at=equilibrium", "initial: give either at", "or q, not both"),
     _value("initial.q={}", "initial: give q (a table by coordinate)", 'at = "equilibrium"'),
-    _value("initial.q=[1.0, 2.0]", "initial.q = [1.0, 2.0]: expected a table, got a list"),
+    _value(
+        "initial.q=[1.0, 2.0, 3.0]",
+        "initial.q: got 3 values; expected 2, in the order theta_1, theta_3 or 4, in the order theta_1, theta_2, ",
+    ),
+    _value("initial.q=[1.0, true]", "initial.q.theta_3 = true: expected a number, got true or false"),
     _value("initial.q.theta_9=1", "initial.q: no coordinate 'theta_9'", "theta_1, theta_3"),
     _value("initial.q.theta_1=abc", f"{NAMED}initial.q.theta_1 = 'abc': expected a number, got a string"),
     _value("initial.q.theta_1=nan", f"initial.q.theta_1 = nan: {FINITE}"),

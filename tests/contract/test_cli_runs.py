@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from ckc_pin import InputError, NumericalError, Run, Terms, load_scene, simulate
+from ckc_pin import NumericalError, Run, Terms, load_scene, simulate
 from ckc_pin.control import Tracking
 from tests.analytic.five_bar import FIVE_BAR, desired
 from tests.conftest import assert_close
@@ -225,11 +225,11 @@ def test_overrides_accept_numpy_values() -> None:
     assert load_scene("five_bar/tracking", overrides).to_dict()["controller"]["K_D"] == [[2.0, 0.0], [0.0, 2.0]]
 
 
-def test_overrides_beside_a_scene_are_rejected() -> None:
+def test_overrides_of_a_scene_are_added_to_its_own() -> None:
     scene = load_scene("five_bar/swing", {"t_end": 0.01})
     assert simulate(scene).t[-1] == 0.01
-    with pytest.raises(InputError, match="overrides are accepted only with the name or path of a scene"):
-        simulate(scene, {"t_end": 1.0})
+    run = simulate(scene, {"solver.output_dt": 0.005})
+    assert run.t.tolist() == [0.0, 0.005, 0.01]
 
 
 @pytest.mark.parametrize("overrides", [{}, {"solver.output_dt": 0.3}, {"solver.output_dt": 7.0}, {"t_end": 1e-9}])

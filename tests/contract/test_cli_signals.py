@@ -213,7 +213,7 @@ SWALLOWED = {
 }
 SWALLOWS = """
 import os, signal, sys, time
-import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
+import ckc_pin, ckc_pin.cli, ckc_pin.scene.names
 
 def list_catalogue():
     try:
@@ -222,7 +222,7 @@ def list_catalogue():
     {clause}
     time.sleep(60)
 
-ckc_pin.scene.scene.list_catalogue = list_catalogue
+ckc_pin.scene.names.list_catalogue = list_catalogue
 ckc_pin.cli.main()
 """
 
@@ -237,14 +237,14 @@ def test_interrupt_that_a_library_swallows_is_raised_again(name: str) -> None:
 
 IMPORTS = """
 import os, signal, sys, time
-import ckc_pin, ckc_pin.cli, ckc_pin.scene.scene
+import ckc_pin, ckc_pin.cli, ckc_pin.scene.names
 
 def list_catalogue():
     import slow
     print("imported as a whole:", slow.done, flush=True)
     time.sleep(60)
 
-ckc_pin.scene.scene.list_catalogue = list_catalogue
+ckc_pin.scene.names.list_catalogue = list_catalogue
 ckc_pin.cli.main()
 """
 SLOW = """

@@ -77,13 +77,13 @@ def test_saved_run_contains_the_generated_mechanism(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.points["B0"], run.points["B0"])
     text, sources = generate(GeneratorSpec(generator="n_four_bar", N=3))
     assert again.texts["mechanism.toml"] == text
-    assert again.texts["n_four_bar.urdf"] == sources.texts["n_four_bar.urdf"]
+    assert again.texts["n_four_bar.urdf"] == sources.text("n_four_bar.urdf")
 
 
 def test_generated_mechanism_can_be_saved_and_loaded(tmp_path: Path) -> None:
     text, sources = generate(GeneratorSpec(generator="n_four_bar", N=2))
     (tmp_path / "mechanism.toml").write_text(text)
-    (tmp_path / "n_four_bar.urdf").write_text(sources.texts["n_four_bar.urdf"])
+    (tmp_path / "n_four_bar.urdf").write_text(sources.text("n_four_bar.urdf"))
     assert load(tmp_path).coordinates == load(GeneratorSpec(generator="n_four_bar", N=2)).coordinates
 
 

@@ -83,8 +83,8 @@ def test_results_that_cannot_be_drawn_or_played_are_rejected() -> None:
     model, scene = linearize("five_bar"), load_scene("five_bar/set_point")
     with pytest.raises(InputError, match="give each other result alone"):
         plot(model, model)
-    with pytest.raises(InputError, match="only with the name or path of a scene"):
-        gain_locus(scene, overrides={"controller.K_P": 1.0})
+    with pytest.raises(InputError, match=r"controller.K_P = 'x': expected a number"):
+        gain_locus(scene, overrides={"controller.K_P": "x"})
     for number in ("a", 0, 1.5, None, 3):
         with pytest.raises(InputError, match="five_bar has modes 1 to 2"):
             model.animate_mode(number)  # type: ignore[arg-type]

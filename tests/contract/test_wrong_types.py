@@ -63,9 +63,10 @@ def set_point() -> SetPoint:
 
 
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "simulate a mechanism": (
-        lambda: simulate(five_bar()),
-        "got a Mechanism, .*five_bar/default, five_bar/friction, five_bar/set",
+    "simulate a mechanism": (lambda: simulate(five_bar()), "a Mechanism has no end time; give t_end, as simulate"),
+    "step a mechanism": (
+        lambda: ckc_pin.Simulator(five_bar()),
+        r"got a Mechanism, .*Scene\(mechanism, t_end=1.0\).*five_bar/default, five_bar/friction, five_bar/set",
     ),
     "simulate a number": (lambda: simulate(3), "simulate: scene: expected a scene.*, got 3"),
     "simulate a run": (lambda: simulate(run()), "simulate: scene: expected .*, got a Run"),
@@ -160,7 +161,10 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "load_scene": (lambda: load_scene(five_bar()), "load_scene: name: expected .*, got a Mechanism"),
     "check": (lambda: ckc_pin.check(run()), "check: what: expected a mechanism or a scene.*, got a Run"),
     "terms of a scene": (lambda: ckc_pin.terms(load_scene(SWING), Q), "terms: mechanism: expected .*, got a Scene"),
-    "terms at an array": (lambda: ckc_pin.terms("five_bar", np.zeros(2)), "q: expected a table.*, got a ndarray"),
+    "terms at an array": (lambda: ckc_pin.terms("five_bar", np.zeros(3)), "terms: q: got 3 values; expected 2, in the"),
+    "terms at a scalar": (lambda: ckc_pin.terms("five_bar", np.array(3.0)), "or an array, got a ndarray"),
+    "terms at a matrix": (lambda: ckc_pin.terms("five_bar", np.eye(2)), "theta_1 = .1.0, 0.0.: expected a number"),
+    "terms at a number": (lambda: ckc_pin.terms("five_bar", 3.0), "q: expected a table by coo.*, or an array, got 3.0"),
     "terms at a word": (lambda: ckc_pin.terms("five_bar", {**Q, "theta_1": "a"}), "theta_1 = 'a': expected a number"),
     "play nothing": (ckc_pin.play, "play: no run given"),
     "play a path": (lambda: ckc_pin.play("runs/a"), "play: runs: expected runs.*, got 'runs/a'"),
@@ -180,7 +184,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "floquet of a run": (lambda: ckc_pin.floquet(run(), 1.0), "floquet: scene: expected a scene.*, got a Run"),
     "no list of names": (lambda: ckc_pin.sensitivities(SWING, 5), r"sensitivities: parameters: expected .*link.link_2"),
     "names by number": (lambda: ckc_pin.sensitivities(SWING, [5]), "sensitivities: parameters: expected .*, got 5"),
-    "ensemble": (lambda: ckc_pin.ensemble(load_scene(SWING), {}, {}), "ensemble: scene: expected .*, got a Scene"),
+    "ensemble": (lambda: ckc_pin.ensemble(five_bar(), {}, {}), "ensemble: scene: expected .*, got a Mechanism"),
     "a variable": (lambda: ckc_pin.ensemble(SWING, "t_end", {}), "ensemble: variables: expected a table.*got 't_end'"),
     "an output": (lambda: ckc_pin.ensemble(SWING, {}, ["u"]), "ensemble: outputs: expected a table by.*got a list"),
     "threads": (lambda: ckc_pin.ensemble(SWING, {}, {}, threads=0.5), "threads: expected a whole number.*, got 0.5"),

@@ -58,7 +58,7 @@ def test_member_equals_a_run_with_its_overrides(case: str) -> None:
     assert result.status.tolist() == [DONE] * 6, result.message
     assert np.ptp(result.outputs["end"], axis=0).max() > 1e-4  # the variables have an effect
     for k, value in enumerate(values):
-        run = ckc_pin.simulate(members.scene_name, members.overrides_of(value))
+        run = ckc_pin.simulate(members.scene_of(value))
         assert np.abs(result.outputs["end"][k] - run.q_tree[-1]).max() < TOLERANCE
         assert np.abs(result.outputs["rate"][k] - run.v_tree[-1]).max() < 10 * TOLERANCE
 

@@ -13,7 +13,7 @@ from ckc_pin.dynamics import Terms, dae_acceleration
 from ckc_pin.errors import CkcError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.plant import Plant
-from ckc_pin.scene.scene import list_catalogue
+from ckc_pin.scene.names import list_catalogue
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.native.loops import start_loop
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from ckc_pin.dynamics import Terms, dae_acceleration
+from ckc_pin.scene.names import list_catalogue
 from ckc_pin.scene.parts import load_scene_mechanism
-from ckc_pin.scene.scene import list_catalogue, load_scene
+from ckc_pin.scene.scene import load_scene
 from tests.native.loops import start_loop, start_loop_and_ivp
 
 FORMULATIONS = [{"formulation": "dae"}, {"formulation": "reduced"}, {"formulation": "spf"}]

@@ -12,8 +12,8 @@ import ckc_pin
 from ckc_pin import InputError, Mechanism, MotionForces, Terms, inverse_dynamics
 from ckc_pin.control.desired import Table
 from ckc_pin.mechanism.library import shipped
+from ckc_pin.scene.names import list_scene_names
 from ckc_pin.scene.parts import load_scene_mechanism
-from ckc_pin.scene.scene import list_scene_names
 from scripts.experiments.fuzz.mechanisms import random_mechanism
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close

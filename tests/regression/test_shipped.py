@@ -12,7 +12,7 @@ import pytest
 from ckc_pin import InputError, Mechanism, Run, check, load, simulate
 from ckc_pin.dynamics import Terms, h_gradient, stable_equilibrium
 from ckc_pin.mechanism.library import library, shipped
-from ckc_pin.scene.scene import list_catalogue, list_scene_names
+from ckc_pin.scene.names import list_catalogue, list_scene_names
 
 # coordinates, freedoms, closure rows, rank, from the literature or by counting
 MOBILITY = {

@@ -27,7 +27,7 @@ from ckc_pin.base.interrupt import acknowledge
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.prepare import prepare
-from ckc_pin.scene.scene import Scene, load_scene
+from ckc_pin.scene.scene import Scene, as_scene
 
 __all__ = [
     "DEFAULT_BUDGET_S",
@@ -261,10 +261,7 @@ def work_precision(
     """
     if not (np.isfinite(budget) and budget > 0):
         raise InputError(f"budget = {budget:g}: expected a number of seconds above zero")
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene, overrides)
-    elif overrides:
-        raise InputError("work_precision: overrides need the name or path of a scene, got a Scene")
+    scene = as_scene(scene, overrides, "work_precision")
     mechanism, result = prepare(scene).mechanism, WorkPrecision(scene.name)
     start = perf_counter()
     try:

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.tree import Tree
 from ckc_pin.run.prepare import prepare
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import run_prepared
-from ckc_pin.scene.scene import Scene, apply_overrides, make_scene
+from ckc_pin.scene.scene import Scene
 
 __all__ = [
     "FORMULATIONS",
@@ -106,7 +106,7 @@ def starts_off_manifold(scene: Scene) -> bool:
 
 def override_scene(scene: Scene, overrides: Mapping[str, Any]) -> Scene:
     """Return a scene with values replaced by dotted key; None removes a key."""
-    return make_scene(apply_overrides(scene.to_dict(), overrides), scene.name, scene.sources)
+    return scene.with_overrides(overrides)
 
 
 def span_overrides(scene: Scene, t_end: float, dt: float) -> dict[str, Any]:

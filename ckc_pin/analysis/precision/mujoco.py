@@ -38,7 +38,7 @@ OUT_OF_BUDGET = "the budget is used up; give a larger one"
 
 def explain_unsupported(scene: Scene) -> str:
     """Return why MuJoCo cannot run a scene; empty if it can."""
-    if scene.spec.controller is not None:
+    if scene.spec.controller is not None or scene.controller is not None:
         return "the scene's controller needs D, C and h of the reduced model, which MuJoCo does not compute"
     if starts_off_manifold(scene):
         return "the scene starts with open loops, phi = w, which MuJoCo does not support"

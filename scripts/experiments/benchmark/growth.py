@@ -148,7 +148,7 @@ def write_case(case: Case, folder: Path) -> Path:
     text = "[[loop]]".join([head, *kept]) + point
     text = re.sub(r"= (-?)1\.5707963267948966", rf"= \g<1>{LEAN}", text.replace('independent = ["theta_0"]\n', ""))
     (folder / "mechanism.toml").write_text(text, encoding="utf-8")
-    for name, content in sources.texts.items():
+    for name, content in sources.available.items():
         (folder / name).write_text(content, encoding="utf-8")
     scene = folder / "row.scene.toml"
     scene.write_text(

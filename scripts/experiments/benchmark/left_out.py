@@ -27,7 +27,8 @@ from ckc_pin.errors import CkcError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.run.ivp import Ivp, as_ivp
 from ckc_pin.run.simulate import simulate
-from ckc_pin.scene.scene import Scene, list_catalogue, load_scene
+from ckc_pin.scene.names import list_catalogue
+from ckc_pin.scene.scene import Scene, load_scene
 
 __all__ = ["MISSING", "MODULES", "TERMS", "LeftOut", "every_scene", "module_costs", "modules_of", "terms_of"]
 

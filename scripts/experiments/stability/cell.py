@@ -16,7 +16,8 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.scene.scene import apply_overrides, make_scene
+from ckc_pin.scene.overrides import apply_overrides
+from ckc_pin.scene.scene import make_scene
 from scripts.experiments.stability.planar import Planar
 from scripts.experiments.stability.reference import Reference
 
