@@ -119,6 +119,20 @@ class JointServo:
         rates = -self.K_I * self._errors(t, terms)[0] - self.unwinding * self.gear * excess
         return np.asarray(rates[self.has_integral])
 
+    @property
+    def desired_q(self) -> Desired | None:
+        """Desired motion of the independent coordinates; None unless each of them has a servo in position mode."""
+        positions = [joint for joint, of_rate in zip(self.joints, self.of_rate, strict=True) if not of_rate]
+        if not set(self.mechanism.partition.q) <= set(positions):
+            return None
+        columns = [self.joints.index(k) for k in self.mechanism.partition.q]
+
+        def desired(t: float) -> tuple[Array, Array, Array]:
+            q, q_dot, q_ddot = self.desired(t)
+            return q[columns], q_dot[columns], q_ddot[columns]
+
+        return desired
+
     def limit_torques(self, limit: Array) -> None:
         """Set the torque limits that act on the motors, (motors,), N m or N."""
         self._limit = limit[self.motors]

@@ -13,6 +13,7 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import convert
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.control.sampled import unwrap_sampled
 from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SetPointSpec, TorquesSpec
@@ -56,22 +57,26 @@ def compute_desired_path(run: Run) -> DesiredPath | None:
     if "controller" not in run.scene:
         return None
     spec: ControllerSpec = convert(run.scene["controller"], ControllerSpec, run.scene_name)  # type: ignore[arg-type]
-    if isinstance(spec, TorquesSpec | JointServoSpec):
+    if isinstance(spec, TorquesSpec):
         return None
-    target: Desired | Array
+    target: Desired | Array | None
     if isinstance(spec, SetPointSpec):
         target = run.mechanism.vector(spec.q_d, run.independent, f"{run.scene_name}: controller.q_d")
+    elif isinstance(spec, JointServoSpec):
+        target = JointServo(run.mechanism, spec.motor).desired_q
     else:
         sources = Sources(run.scene_name, None, run.texts)
         target = make_desired(spec.desired, run.mechanism, sources, float(run.t[-1]))
-    return sample_target(target, run.t, len(run.independent))
+    return None if target is None else sample_target(target, run.t, len(run.independent))
 
 
 def find_target(controller: Any) -> Desired | Array | None:
-    """Return the desired motion of a `Tracking`, or q_d of a `SetPoint`, also of a sampled one; None of others."""
+    """Return the desired motion of a controller, or q_d of a `SetPoint`, also of a sampled one; None of others."""
     law = unwrap_sampled(controller)
     if isinstance(law, Tracking):
         return law.desired
+    if isinstance(law, JointServo):
+        return law.desired_q
     return law.q_d if isinstance(law, SetPoint) else None
 
 

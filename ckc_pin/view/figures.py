@@ -32,8 +32,10 @@ __all__ = ["FORMATS", "draw_runs", "plot_runs", "require_formats", "write_figure
 FORMATS = ("png", "svg", "pdf")
 TITLES = {
     "set_point": "set-point control",
+    "joint_servo": "joint servos",
     "tracking": "tracking control",
     "own": "own controller",
+    "prescribed": "prescribed motion",
     "motion": "motion without control",
 }
 PAPER_FIGURES = {"five_bar/set_point": "Fig. 3, eq. 14", "five_bar/tracking": "Fig. 4, eq. 16"}
@@ -60,9 +62,9 @@ def plot_runs(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[
     Returns
     -------
     list of Path
-        The files. Their names are ``set_point``, ``tracking``, ``own`` or ``motion``, alone and with suffixes:
-        ``_snapshots``; for controlled runs ``_checks``, which shows whether to trust a run; and ``_coordinates`` and
-        ``_efforts`` with a small panel for each, if there are more than colours.
+        The files. Their names are ``set_point``, ``tracking``, ``joint_servo``, ``prescribed``, ``own`` or ``motion``,
+        alone and with suffixes: ``_snapshots``; for controlled runs ``_checks``, which shows whether to trust a run;
+        and ``_coordinates`` and ``_efforts`` with a small panel for each, if there are more than colours.
 
     Raises
     ------
@@ -120,7 +122,8 @@ def _group_runs(runs: Iterable[Run]) -> list[RunGroup]:
     for run in runs:
         controller = run.scene.get("controller")
         law = controller["type"] if controller else "torques"
-        kind = str(law) if law != "torques" else "own" if np.any(run.tau) else "motion"
+        uncontrolled = "prescribed" if run.scene.get("prescribed") else "own" if np.any(run.tau) else "motion"
+        kind = uncontrolled if law == "torques" else str(law)
         members.setdefault((kind, run.mechanism.name, run.coordinates, run.independent, run.actuated), []).append(run)
     groups = []
     for (kind, *_), group_runs in members.items():
@@ -161,23 +164,26 @@ def _draw_set_point(group: RunGroup) -> Figure:
 def _draw_tracking(group: RunGroup) -> Figure:
     """Draw the paper's Fig. 4: a) configuration space, b) torques, c) angles, d) velocities.
 
-    With more than two freedoms panel a shows errors, or the energy if there is no desired motion.
+    With more than two freedoms and of prescribed motions, panel a shows errors, or the energy if there is no desired
+    motion.
     """
     d = len(group.independent)
-    if d <= 2:
+    has_plane = 0 < d <= 2 and group.kind != "prescribed"
+    names = group.coordinates if len(group.coordinates) <= MAX_PANEL_COORDINATES else group.independent
+    if has_plane:
         first_title = "phase plane" if d == 1 else "configuration space"
     else:
         first_title = "errors" if group.distinct_desired else "energy"
     slots = _create_page(group, [first_title, _efforts_title(group), "coordinates", "velocities"])
-    if d <= 2:
+    if has_plane:
         panels.draw_configuration_space(slots[0], group)
     elif group.distinct_desired:
         panels.draw_errors(slots[0], group, group.independent)
     else:
         panels.draw_scalar(slots[0], group, lambda run: run.energy, axis_label("$E$", "J"))
     panels.draw_efforts(slots[1], group, group.runs[0].actuated, _describe_peaks(group))
-    panels.draw_coordinates(slots[2], group, group.independent)
-    panels.draw_rates(slots[3], group, group.independent)
+    panels.draw_coordinates(slots[2], group, names)
+    panels.draw_rates(slots[3], group, names)
     desired_dot = legend_line("black", "desired", linestyle="none", marker=".", markersize=4)
     _add_legend(slots[0].figure, group, extra_handles=[desired_dot] if group.distinct_desired else [])
     return slots[0].figure
@@ -240,7 +246,7 @@ def _draw_small_panels(group: RunGroup) -> dict[str, Figure]:
     """Draw a small panel for each coordinate and each motor, if there are more of them than colours."""
     from matplotlib import rc_context
 
-    coordinates = group.runs[0].coordinates if group.kind == "motion" else group.independent
+    coordinates = group.coordinates
     motors = group.runs[0].actuated if group.kind != "motion" else ()
     kinds: dict[str, tuple[Sequence[str], Callable[[PanelSlot, RunGroup, Sequence[str]], None]]] = {
         "coordinates": (coordinates, panels.draw_coordinates),
@@ -267,7 +273,10 @@ def _draw_small_panels(group: RunGroup) -> dict[str, Figure]:
     return figures
 
 
-_LAYOUTS = {"set_point": _draw_set_point, "tracking": _draw_tracking, "own": _draw_tracking, "motion": _draw_motion}
+_LAYOUTS = {
+    "set_point": _draw_set_point, "tracking": _draw_tracking, "joint_servo": _draw_tracking,
+    "prescribed": _draw_tracking, "own": _draw_tracking, "motion": _draw_motion,
+}  # fmt: skip
 
 
 # --- parts ---------------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ class RunGroup:
 
     Attributes
     ----------
-    kind : "set_point", "tracking", "own" (a controller written in Python) or "motion" (no control)
+    kind : "set_point", "tracking", "joint_servo", "own" (a controller written in Python) or "motion" (no control)
     runs : list of Run
         In drawing order.
     desired_paths : list of DesiredPath or None
@@ -124,11 +124,15 @@ class RunGroup:
         return [escape_mathtext(label) + text for label, text in zip(label_runs(self.runs), outcomes, strict=True)]
 
     @cached_property
+    def coordinates(self) -> list[str]:
+        """Coordinates with curves: all of them without a controller, else the independent ones."""
+        is_controlled = self.kind not in ("motion", "prescribed")
+        return list(dict.fromkeys([*self.independent, *(() if is_controlled else self.runs[0].coordinates)]))
+
+    @cached_property
     def curve_names(self) -> list[str]:
-        """Coordinates and motors with curves: all coordinates without control, else independent ones and motors."""
-        run = self.runs[0]
-        dependent = [name for name in run.coordinates if name not in self.independent]
-        return list(dict.fromkeys([*self.independent, *(dependent if self.kind == "motion" else run.actuated)]))
+        """Coordinates and motors with curves; a motion without control has none of motors."""
+        return list(dict.fromkeys([*self.coordinates, *(() if self.kind == "motion" else self.runs[0].actuated)]))
 
     @cached_property
     def colours(self) -> dict[str, str]:

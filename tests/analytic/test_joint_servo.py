@@ -177,6 +177,19 @@ def test_gravity_is_balanced_at_the_start() -> None:
     assert_close(run.tau[-1], FIVE_BAR.h(FIVE_BAR.sigma(START)), 1e-8)
 
 
+def test_the_desired_motion_of_position_servos_is_a_quantity(tmp_path: Path) -> None:
+    """`desired` exists where every independent coordinate has one, in the order of `independent`."""
+    servo = {"K_P": 8.0, "K_D": 0.6}
+    motors = {"theta_3": {**servo, "desired": {"offset": -1.9}}, "theta_1": {**servo, "desired": MOTION}}
+    run = simulate("five_bar/swing", servo_scene(controller={"type": "joint_servo", "motor": motors}))
+    expected = np.array([motion(t)[0] for t in run.t])
+    for one in (run, ckc_pin.Run.load(run.save(tmp_path / "run.npz"))):
+        assert_close(one["desired.theta_1"], expected, 1e-12)
+        assert_close(one["error.theta_3"], one["theta_3"] + 1.9, 1e-12)
+    assert simulate("five_bar/swing", servo_scene()).desired is None
+    ckc_pin.plot(run).save(tmp_path)
+
+
 def test_a_motor_without_a_servo_has_no_torque() -> None:
     controller = {"type": "joint_servo", "motor": {"theta_3": SERVOS["theta_3"]}}
     run = simulate("five_bar/swing", servo_scene(controller=controller))

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import brentq
 
-from ckc_pin import CkcError, InputError, Run, Simulator, check, inverse_dynamics, load, sensitivities, simulate
+from ckc_pin import CkcError, InputError, Run, Simulator, check, inverse_dynamics, load, plot, sensitivities, simulate
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -277,3 +277,15 @@ def test_paper_controllers_are_refused_with_prescribed_joints() -> None:
 def test_harmonics_of_the_test_are_those_of_the_scene() -> None:
     ours = Harmonics([MotionSpec(offset=-1.4, harmonics=[(0.3, 5.0, 0.4), (0.05, 13.0, -0.3)])])(0.7)
     assert_close(np.ravel(ours), np.array(left_crank(0.7)), 1e-12)
+
+
+@pytest.mark.parametrize("has_freedom", [False, True])
+def test_prescribed_motions_are_drawn_and_played(tmp_path: Path, has_freedom: bool) -> None:
+    """Also without any freedom, where all coordinates are drawn."""
+    crank = {"prescribed": [{"joint": "crank", "rate": 5.0}], "t_end": 0.2}
+    run = simulate("five_bar/swing", scene("reduced", t_end=0.2)) if has_freedom else simulate("slider_crank", crank)
+    figures = plot(run)
+    names = [path.name for path in figures.save(tmp_path)]
+    assert names == ["prescribed.png", "prescribed_checks.png", "prescribed_snapshots.png"]
+    page = run.play(inline=True).save(tmp_path / "motion.html")  # type: ignore[union-attr]
+    assert page.stat().st_size > 10_000
