@@ -252,6 +252,7 @@ def linear_model(
     smoothing: float | None = None,
     library: Library | None = None,
     forces: Sequence[BodyForce] = (),
+    correction: Array | None = None,
     notes: tuple[str, ...] = (),
 ) -> LinearModel:
     """Linearize eq. 1 about a state.
@@ -276,6 +277,8 @@ def linear_model(
         Compiled terms of the mechanism.
     forces : sequence of BodyForce, optional
         Constant forces on links, whose components become inputs.
+    correction : (rows,) array, optional
+        Minus the prescribed acceleration of the constraint rows.
     notes : tuple of str, optional
         Notes about the state, which come before those about the model.
 
@@ -295,7 +298,7 @@ def linear_model(
         )
     _require_mass(terms, locked)
     u_tree = mechanism.motors.force(tau) + u_tree
-    plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked, forces)
+    plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked, forces, correction)
     push = unit_forces(forces, terms)
     u_tree = u_tree + generalized_force(forces, force_values(forces, 0.0, terms), terms)
     if not len(plant.at):

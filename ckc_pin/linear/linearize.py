@@ -45,6 +45,7 @@ from ckc_pin.scene.parts import (
     build_scene_controller,
     build_scene_forces,
     load_scene_mechanism,
+    prescribed_motion,
 )
 from ckc_pin.scene.scene import Scene, load_scene
 
@@ -172,7 +173,6 @@ def _find_subject(what: Mechanism | Scene | str | Path, at: At, overrides: Mappi
     if not isinstance(what, Scene):
         return _Subject(what, None)
     mechanism = load_scene_mechanism(what)
-    mechanism.refuse_prescribed_joints("linearize")
     return _Subject(mechanism, what)
 
 
@@ -268,6 +268,8 @@ def _linearize_at_rest(
     sticking = np.flatnonzero(subject.mechanism.joints.friction) if subject.smoothing is None else NONE
     locked = np.union1d(sticking, loaded_stops)
     forces = subject.forces_at_rest
+    if prescribed := subject.mechanism.prescribed:
+        notes = (*notes, f"at rest at the position where the prescribed motion begins: {', '.join(prescribed)}")
     if forces:
         notes = (*notes, "forces on links are inputs, zero at the state")
     return linear_model(
@@ -292,7 +294,11 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
             remedy = "because a DAE without projection drifts; set solver.projection = true"
         raise InputError(f"at t = {t:.15g} s the loops of {scene.name} are open (|phi| = {max_phi:.3g}), {remedy}")
     at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
-    state = _project_onto_manifold(Terms(mechanism, at, run.v_tree[k]))
+    state, correction = Terms(mechanism, at, run.v_tree[k]), np.zeros(mechanism.closure.rows)
+    if mechanism.prescribed:  # the rows of prescribed joints are neither zero nor constant
+        correction[mechanism.prescribed_rows] = -prescribed_motion(run.prescribed)(t)[2]
+    else:
+        state = _project_onto_manifold(state)
     joints = RecordedJoints(run)
     locked, smoothing = joints.locked[k], subject.smoothing
     friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sliding_signs[k]
@@ -308,6 +314,7 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
         smoothing=smoothing,
         library=subject.library,
         forces=forces,
+        correction=correction,
         notes=_describe_instant(scene, run, k),
     )
     law = build_scene_controller(scene, mechanism)

@@ -750,6 +750,7 @@ class Linearization:
         u_tree: numpy.typing.NDArray[numpy.float64],
         locked: list[int],
         forces: list[dict[str, Any]],
+        correction: numpy.typing.NDArray[numpy.float64],
     ) -> dict[str, Any] | None:
         """Return the linearization at one state; None if J has lost rank."""
 

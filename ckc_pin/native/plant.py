@@ -94,7 +94,12 @@ class Plant:
         self._native = _core.Linearization(core_table(mechanism, library, smoothing), mechanism.motors.transmission)
 
     def at(
-        self, terms: Terms, u_tree: Array, locked: IntArray = NONE, forces: Sequence[BodyForce] = ()
+        self,
+        terms: Terms,
+        u_tree: Array,
+        locked: IntArray = NONE,
+        forces: Sequence[BodyForce] = (),
+        correction: Array | None = None,
     ) -> AccelerationDerivatives:
         """Solve eq. 1 at a state and differentiate the solution.
 
@@ -108,6 +113,8 @@ class Plant:
             Coordinates that do not move, as of sticking joints.
         forces : sequence of BodyForce, optional
             Constant forces on links.
+        correction : (rows,) array, optional
+            Minus the prescribed acceleration of the constraint rows.
 
         Raises
         ------
@@ -115,7 +122,10 @@ class Plant:
             J is rank deficient.
         """
         tables = force_tables(forces)
-        solution = self._native.at(terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist(), tables)
+        if correction is None:
+            correction = np.zeros(self.mechanism.closure.rows)
+        state = (terms.q_tree, terms.v_tree, u_tree, np.asarray(locked).tolist())
+        solution = self._native.at(*state, tables, correction)
         if solution is None:
             tree = self.mechanism.tree
             raise NumericalError(

@@ -12,7 +12,19 @@ import pytest
 from scipy.integrate import simpson, solve_ivp
 from scipy.optimize import brentq
 
-from ckc_pin import CkcError, InputError, Run, Simulator, check, inverse_dynamics, load, plot, sensitivities, simulate
+from ckc_pin import (
+    CkcError,
+    InputError,
+    Run,
+    Simulator,
+    check,
+    inverse_dynamics,
+    linearize,
+    load,
+    plot,
+    sensitivities,
+    simulate,
+)
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
@@ -108,6 +120,34 @@ def test_accelerations_and_loop_forces_contain_the_prescribed_motion(formulation
         assert_close(acceleration, a_tree, 1e-7)
         force = FIVE_BAR.D_tree(q_tree) @ a_tree + FIVE_BAR.C_tree(q_tree, v_tree) @ v_tree + FIVE_BAR.h_tree(q_tree)
         assert_close(multipliers, np.linalg.solve(FIVE_BAR.J(q_tree)[:, [1, 3]].T, force[[1, 3]]), 1e-7)
+
+
+def test_linear_model_is_that_of_the_problem_with_the_joint_eliminated() -> None:
+    t = 0.65
+    model = linearize("five_bar/swing", t, scene("reduced"))
+    assert len(model.A) == 2
+    q_1, q_1_dot, q_1_ddot = left_crank(t)
+
+    def acceleration(q_3: float, q_3_dot: float, tau: float = 0.0) -> float:
+        q_tree, q_dot = FIVE_BAR.sigma(np.array([q_1, q_3])), np.array([q_1_dot, q_3_dot])
+        D = FIVE_BAR.D(q_tree)
+        rest = FIVE_BAR.C(q_tree, FIVE_BAR.rho(q_tree) @ q_dot) @ q_dot + FIVE_BAR.h(q_tree)
+        return float((tau - rest[1] - D[1, 0] * q_1_ddot) / D[1, 1])
+
+    q_3, rate, e = model.q_tree[2], model.v_tree[2], 1e-5
+    by_q = (acceleration(q_3 + e, rate) - acceleration(q_3 - e, rate)) / (2 * e)
+    by_rate = (acceleration(q_3, rate + e) - acceleration(q_3, rate - e)) / (2 * e)
+    by_tau = acceleration(q_3, rate, 1.0) - acceleration(q_3, rate)
+    assert_close(model.A, [[0.0, 1.0], [by_q, by_rate]], 1e-5)
+    crank, other = (model.inputs.index(name) for name in model.inputs)
+    assert_close(model.B[1, [crank, other]], [0.0, by_tau], 1e-8)
+
+
+def test_linear_model_at_rest_keeps_the_prescribed_joint_at_its_start() -> None:
+    model = linearize("five_bar/swing", "equilibrium", scene("reduced"))
+    assert_close(model.q_tree[0], START["theta_1"], 1e-12)
+    assert len(model.A) == 2
+    assert "at rest at the position where the prescribed motion begins: theta_1" in model.notes
 
 
 def test_inverse_dynamics_of_a_scene_with_prescribed_joints_asks_for_its_run() -> None:

@@ -27,12 +27,14 @@ void require_state(const Linearization& linearization, In q_tree, In v_tree, In 
   require_indices(locked, core.n, "locked");
 }
 
-// Return the linearization at one state under u' and forces on links; None if J has lost rank.
+// Return the linearization at one state under u' and forces on links, where rows accelerate by -correction; None if J has lost rank.
 std::optional<nb::typed<nb::dict, nb::str, nb::any>> linearize(Linearization& linearization, VectorArg q_tree,
                                                                VectorArg v_tree, VectorArg u_tree,
                                                                const Indices& locked,
-                                                               const std::vector<nb::dict>& forces) {
+                                                               const std::vector<nb::dict>& forces,
+                                                               VectorArg correction) {
   require_state(linearization, q_tree, v_tree, u_tree, locked);
+  require(correction, linearization.core->constraints.closure.rows, "correction");
   Core& core = *linearization.core;
   Vector force = u_tree;
   Matrix force_by_q;
@@ -45,7 +47,7 @@ std::optional<nb::typed<nb::dict, nb::str, nb::any>> linearize(Linearization& li
     force += on_links->value, force_by_q.setZero(core.n, core.n);
     require(on_links->add_derivative(core, force_by_q), "forces: constant ones are needed");
   }
-  if (!linearization.compute(q_tree, v_tree, force, locked, force_by_q)) return {};
+  if (!linearization.compute(q_tree, v_tree, force, locked, force_by_q, correction)) return {};
   linearization.solve_multipliers();
   nb::typed<nb::dict, nb::str, nb::any> result;
   result["at"] = linearization.coordinates, result["T"] = linearization.T, result["V"] = linearization.V,
@@ -60,12 +62,13 @@ std::optional<nb::typed<nb::dict, nb::str, nb::any>> linearize(Linearization& li
 // Return the time to compute A and B, s: minimum of several rounds.
 double seconds(Linearization& linearization, VectorArg q_tree, VectorArg v_tree, VectorArg u_tree, int rounds) {
   require_state(linearization, q_tree, v_tree, u_tree, {});
-  const Vector q = q_tree, v = v_tree, u = u_tree;
+  const Vector q = q_tree, v = v_tree, u = u_tree,
+               none = Vector::Zero(linearization.core->constraints.closure.rows);
   constexpr int repetitions = 20;
   double shortest = std::numeric_limits<double>::infinity();
   for (int round = 0; round < rounds; ++round) {
     const auto start = std::chrono::steady_clock::now();
-    for (int k = 0; k < repetitions; ++k) require(linearization.compute(q, v, u, {}), "q_tree: J has lost rank there");
+    for (int k = 0; k < repetitions; ++k) require(linearization.compute(q, v, u, {}, {}, none), "q_tree: J has lost rank there");
     shortest = std::min(shortest, std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
   }
   return shortest / repetitions;
@@ -101,10 +104,11 @@ class Feedback {
 void bind_linearization(nb::module_& m) {
   nb::class_<Linearization>(m, "Linearization", "Linearizes eq. 1 at one state after another.")
       .def(nb::new_(&linearization_from_table), "core"_a, "transmission"_a)
-      .def("at", &linearize, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a, "forces"_a,
+      .def("at", &linearize, "q_tree"_a, "v_tree"_a, "u_tree"_a, "locked"_a, "forces"_a, "correction"_a,
            nb::sig("def at(self, q_tree: numpy.typing.NDArray[numpy.float64], v_tree: "
                    "numpy.typing.NDArray[numpy.float64], u_tree: numpy.typing.NDArray[numpy.float64], "
-                   "locked: list[int], forces: list[dict[str, typing.Any]]) -> dict[str, typing.Any] | None"),
+                   "locked: list[int], forces: list[dict[str, typing.Any]], "
+                   "correction: numpy.typing.NDArray[numpy.float64]) -> dict[str, typing.Any] | None"),
            "Return the linearization at one state; None if J has lost rank.")
       .def("seconds", &seconds, "q_tree"_a, "v_tree"_a, "u_tree"_a, "rounds"_a);
   nb::class_<Feedback>(m, "Feedback", "A controller with its motors, evaluated and differentiated at one state.")

@@ -16,13 +16,14 @@ Linearization::Linearization(std::unique_ptr<Core> core_, Matrix transmission_)
   acceleration.a.setZero(core->n), residual_.setZero(core->constraints.closure.rows);
 }
 
-bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked, const Matrix& u_by_q) {
+bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked, const Matrix& u_by_q,
+                            In correction) {
   Core& c = *core;
   c.joints.locked = locked;
   c.set_configuration(q_tree, true), c.set_velocity(v);
-  u_tree_ = u_tree, u_by_q_ = u_by_q, residual_.setZero();
+  u_tree_ = u_tree, u_by_q_ = u_by_q, correction_ = correction;
   force_ = {u_tree, u_by_q, {}};
-  if (!c.acceleration_derivatives(c.q_tree, v, residual_, force_, acceleration, true) || !find_basis()) return false;
+  if (!c.acceleration_derivatives(c.q_tree, v, correction_, force_, acceleration, true) || !find_basis()) return false;
   compute_velocity_dependence(v), assemble_A_B(v);
   return true;
 }
@@ -162,8 +163,7 @@ void Linearization::solve_multipliers() {
   Core& c = *core;
   const Indices& locked = c.joints.locked;
   const Eigen::Index n = c.n, m = c.constraints.closure.rows;
-  residual_.setZero();
-  if (locked.empty()) c.dae_acceleration(force_.value, residual_, acceleration.a);
+  if (locked.empty()) c.dae_acceleration(force_.value, correction_, acceleration.a);
   lambda.setZero(m);
   for (Matrix* x : {&lambda_q, &lambda_v, &lambda_u}) x->setZero(m, n);
   if (!m) return;

@@ -16,8 +16,9 @@ class Linearization {
   Linearization(std::unique_ptr<Core> core, Matrix transmission);
 
   // Linearize at (q', v') under u' and smooth friction. `u_by_q`: derivative of u' with respect to q' (tangent), empty
-  // if it is constant. `locked` coordinates do not move. False if J has lost rank.
-  bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked, const Matrix& u_by_q = {});
+  // if it is constant. `locked` coordinates do not move. `correction`: minus the prescribed acceleration of rows. False
+  // if J has lost rank.
+  bool compute(In q_tree, In v_tree, In u_tree, const Indices& locked, const Matrix& u_by_q, In correction);
   // After `compute`: the acceleration, minimum-norm multipliers, and the multipliers' derivatives.
   void solve_multipliers();
 
@@ -41,7 +42,7 @@ class Linearization {
 
   Matrix rate_by_q_, u_by_q_;
   AppliedForce force_;
-  Vector u_tree_, residual_;
+  Vector u_tree_, residual_, correction_;
   bool uses_rho_ = false;  // whether T is rho
 };
 
