@@ -51,10 +51,10 @@ class LinearModel(HasSummary):
     t : float or None
         Time of a state of a run, s.
     states, inputs, outputs : tuple of str
-        The states are d coordinates and then their rates, ``NAME_dot``. The inputs are the motors, and the components
-        of the scene's forces on links, ``force.NAME.fx``. The outputs are the
-        coordinates of the tree, ``point:NAME.x`` and ``loop:LOOP.ROW``, the multipliers of eq. 1. A free root has
-        tangent coordinates in its own axes.
+        The names of quantities of runs. The states are d coordinates, ``theta_1``, and then their rates,
+        ``v.theta_1``. The inputs are the motor torques, ``tau.MOTOR``, and the components of the scene's forces on
+        links, ``force.NAME.fx``. The outputs are the coordinates of the tree, points, ``tip.x``, and the multipliers
+        of eq. 1, ``loop.LOOP.ROW``. A free root has tangent coordinates in its own axes.
     A, B, C, D : arrays
         SI units. D is the feedthrough.
     q_tree, v_tree : (n,) arrays
@@ -312,15 +312,15 @@ def linear_model(
         mechanism=mechanism,
         at=at,
         t=t,
-        states=(*chart, *(f"{name}_dot" for name in chart)),
+        states=(*chart, *(f"v.{name}" for name in chart)),
         inputs=(
-            *mechanism.actuated,
+            *(f"tau.{motor}" for motor in mechanism.actuated),
             *(f"force.{force.name}.{component}" for force in forces for component in COMPONENTS),
         ),
         outputs=(
             *mechanism.coordinates,
-            *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
-            *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
+            *(f"{name}.{axis}" for name in points for axis in "xyz"),
+            *(f"loop.{loop}.{row}" for loop, row in mechanism.closure.names),
         ),
         A=plant.A,
         B=np.hstack([plant.B, np.vstack([np.zeros((len(chart), push.shape[1])), plant.a_u[plant.at] @ push])]),
