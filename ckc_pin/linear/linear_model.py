@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.atomic_files import open_atomic, write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
+from ckc_pin.base.tables import require_distinct, to_csv_text, to_data_frame
 from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.forces import COMPONENTS, BodyForce, force_values, generalized_force, unit_forces
@@ -27,7 +28,10 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.plant import NONE, AccelerationDerivatives, Plant
 
 if TYPE_CHECKING:
+    import pandas
+
     from ckc_pin.run.run import Run
+    from ckc_pin.view.inline import Figures
 
 __all__ = ["LinearModel", "Mode", "linear_model"]
 
@@ -116,6 +120,40 @@ class LinearModel(HasSummary):
         from ckc_pin.linear.mode_animation import animate_mode
 
         return animate_mode(self, number)
+
+    def plot(self) -> Figures:
+        """Draw poles and mode shapes. A notebook shows the figures and `save(folder)` writes them."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return A, B, C and D as one pandas DataFrame with names (needs the extra `data`).
+
+        It is the block matrix ``[[A, B], [C, D]]``. Each row is an equation: the rate of a state, ``d/dt v.theta_1``,
+        or an output, ``tip.x``. The columns are the states and then the inputs. ``frame.loc["tip.x", "theta_1"]`` is
+        an entry of C.
+        """
+        return to_data_frame("equation", *self._table("LinearModel.to_pandas"))
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the table of `to_pandas` as CSV, with all digits of each number.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or two states or inputs have the same name.
+        """
+        require_path(path, "LinearModel.to_csv: path")
+        write_atomic(Path(path), to_csv_text("equation", *self._table("LinearModel.to_csv")))
+        return Path(path)
+
+    def _table(self, where: str) -> tuple[tuple[str, ...], dict[str, Array]]:
+        """Return the names of the rows, and the columns by name."""
+        matrix = np.block([[self.A, self.B], [self.C, self.D]])
+        columns = zip((*self.states, *self.inputs), matrix.T, strict=True)
+        equations = (*(f"d/dt {state}" for state in self.states), *self.outputs)
+        return equations, require_distinct(columns, "equation", where)
 
     def to_statespace(self) -> Any:
         """Convert to a `control.StateSpace` of python-control.

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from scipy.linalg import expm
 
@@ -80,6 +81,24 @@ def test_states_inputs_and_outputs_have_names() -> None:
     assert plant.output_labels[-1] == "loop_elbow_y"
     agree(plant.A, model.A)
     agree(np.sort(plant.poles().imag), np.sort(model.eigenvalues.imag))
+
+
+def test_table_of_matrices_has_a_name_for_each_row_and_column(tmp_path: Path) -> None:
+    model = linearize("five_bar", {"theta_1": 1.9, "theta_3": 1.2})
+    frame = model.to_pandas()
+    assert list(frame.columns) == ["theta_1", "theta_3", "v.theta_1", "v.theta_3", "tau.theta_1", "tau.theta_3"]
+    assert list(frame.index[:4]) == ["d/dt theta_1", "d/dt theta_3", "d/dt v.theta_1", "d/dt v.theta_3"]
+    assert tuple(frame.index[4:]) == model.outputs
+    A, B, C, D = linearize_appendix(model.q_tree, np.zeros(2), model.tau)
+    accelerations, forces = ["d/dt v.theta_1", "d/dt v.theta_3"], ["loop.elbow.x", "loop.elbow.y"]
+    states, inputs = list(model.states), list(model.inputs)
+    agree(frame.loc[accelerations, states].to_numpy(), A[2:], 1e-9)
+    agree(frame.loc[accelerations, inputs].to_numpy(), B[2:], 1e-9)
+    agree(frame.loc[forces, states].to_numpy(), C, 1e-9)
+    agree(frame.loc[forces, inputs].to_numpy(), D, 1e-9)
+    file = pandas.read_csv(model.to_csv(tmp_path / "model.csv"), index_col="equation")
+    assert file.equals(frame)
+    assert repr(model.plot()) == "Figures(poles, modes)"
 
 
 def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
