@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
+    import xarray
+
     from ckc_pin.analysis.check import Check, check
     from ckc_pin.codegen.symbolic import Symbolic
     from ckc_pin.control.controllers import Controller, SetPoint, Tracking
@@ -233,13 +235,17 @@ def play(
     )
 
 
-def plot(*shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces) -> Figures:
-    """Draw figures of runs, a linear model, a root locus, sensitivities or inverse dynamics.
+def plot(
+    *shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | xarray.Dataset,
+) -> Figures:
+    """Draw figures of runs, or of another result: a linear model, a root locus, sensitivities, a map, an ensemble.
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities or MotionForces
+    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap or xarray.Dataset
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
+        The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
+        map over two.
 
     Returns
     -------

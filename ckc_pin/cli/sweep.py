@@ -120,10 +120,10 @@ def _draw_and_save_worst(result: SweepResult, out: Path, worst: tuple[str, ...],
     """Draw figures, then run the worst members again and save the runs."""
     dataset = result.open_results()
     if figures:
-        from ckc_pin.view.ensemble_figures import draw_ensemble
+        from ckc_pin.view.ensemble_figures import save_ensemble
 
         with skip_figures_without_matplotlib():
-            draw_ensemble(dataset, out)
+            save_ensemble(dataset, out)
     for name in worst:
         from ckc_pin.ensembles.ensemble import save_worst_members
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
+from ckc_pin.base.tables import require_distinct, to_csv_text, to_data_frame
+from ckc_pin.base.validation import require_path
+
+if TYPE_CHECKING:
+    import pandas
+
+    from ckc_pin.view.inline import Figures
 
 __all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
 
@@ -62,15 +71,21 @@ class Aspect:
         n_2 = 1 in a map over one coordinate.
     det_phi_z : (n_1, n_2) array
         NaN where not reached. The smallest singular value if phi_z is not square.
+    sigma_min : (n_1, n_2) array
+        Smallest singular value of phi_z, NaN where not reached.
     q_tree : (n_1, n_2, nq) array
         The configurations, NaN where not reached.
+    coordinates : (n_1, n_2, n) array
+        The same by coordinate; a free root has its position and rotation vector.
     point : (n_1, n_2, 3) array or None
         Position of the mechanism's point, metres.
     """
 
     reached: BoolArray
     det_phi_z: Array
+    sigma_min: Array
     q_tree: Array
+    coordinates: Array
     point: Array | None
 
 
@@ -166,6 +181,8 @@ class SingularityMap(HasSummary):
     Attributes
     ----------
     mechanism : str
+    coordinates : tuple of str
+        Names of the tree's coordinates.
     space : "joint" or "cartesian"
     point : str or None
         The point for serial singularities and for Cartesian space.
@@ -187,6 +204,7 @@ class SingularityMap(HasSummary):
     """
 
     mechanism: str
+    coordinates: tuple[str, ...]
     space: Space
     point: str | None
     axes: tuple[Axis, ...]
@@ -270,6 +288,47 @@ class SingularityMap(HasSummary):
             "seconds": self.seconds,
             "notes": list(self.notes),
         }
+
+    def plot(self) -> Figures:
+        """Draw the map. A notebook shows the figure and `save(folder)` writes it."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the reached cells as a pandas DataFrame by branch (needs the extra `data`).
+
+        A row is a cell that a branch reaches. The columns are the tree's coordinates, the position of the map's point
+        if it has one, as ``tip.x``, the smallest singular value of phi_z, ``sigma_min``, and ``det_phi_z`` if phi_z is
+        square. The index is the number of the branch, 1 for the assembled one.
+        """
+        return to_data_frame("branch", *self._table("SingularityMap.to_pandas"))
+
+    def to_csv(self, path: str | FilePath) -> FilePath:
+        """Write the table of `to_pandas` as CSV, with all digits of each number.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or a joint has the name of another column.
+        """
+        require_path(path, "SingularityMap.to_csv: path")
+        write_atomic(FilePath(path), to_csv_text("branch", *self._table("SingularityMap.to_csv")))
+        return FilePath(path)
+
+    def _table(self, where: str) -> tuple[IntArray, dict[str, Array]]:
+        """Return the branch of each reached cell, and the columns by name."""
+        blocks = [np.concatenate([aspect.coordinates[aspect.reached] for aspect in self.aspects])]
+        names = list(self.coordinates)
+        points = [aspect.point[aspect.reached] for aspect in self.aspects if aspect.point is not None]
+        if points:
+            blocks.append(np.concatenate(points))
+            names += [f"{self.point}.{axis}" for axis in "xyz"]
+        for name in ("sigma_min", "det_phi_z") if self.measure.startswith("det") else ("sigma_min",):
+            blocks.append(np.concatenate([getattr(aspect, name)[aspect.reached] for aspect in self.aspects])[:, None])
+            names.append(name)
+        branches = np.repeat(np.arange(1, len(self.aspects) + 1), [aspect.reached.sum() for aspect in self.aspects])
+        return branches, require_distinct(zip(names, np.hstack(blocks).T, strict=True), "branch", where)
 
     @property
     def counts(self) -> IntArray:

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.atomic_files import open_atomic, write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, to_pairs
+from ckc_pin.base.tables import require_distinct, to_csv_text, to_data_frame
 from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
 from ckc_pin.control.forces import COMPONENTS, BodyForce, force_values, generalized_force, unit_forces
@@ -27,7 +28,10 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native.plant import NONE, AccelerationDerivatives, Plant
 
 if TYPE_CHECKING:
+    import pandas
+
     from ckc_pin.run.run import Run
+    from ckc_pin.view.inline import Figures
 
 __all__ = ["LinearModel", "Mode", "linear_model"]
 
@@ -51,10 +55,10 @@ class LinearModel(HasSummary):
     t : float or None
         Time of a state of a run, s.
     states, inputs, outputs : tuple of str
-        The states are d coordinates and then their rates, ``NAME_dot``. The inputs are the motors, and the components
-        of the scene's forces on links, ``force.NAME.fx``. The outputs are the
-        coordinates of the tree, ``point:NAME.x`` and ``loop:LOOP.ROW``, the multipliers of eq. 1. A free root has
-        tangent coordinates in its own axes.
+        The names of quantities of runs. The states are d coordinates, ``theta_1``, and then their rates,
+        ``v.theta_1``. The inputs are the motor torques, ``tau.MOTOR``, and the components of the scene's forces on
+        links, ``force.NAME.fx``. The outputs are the coordinates of the tree, points, ``tip.x``, and the multipliers
+        of eq. 1, ``loop.LOOP.ROW``. A free root has tangent coordinates in its own axes.
     A, B, C, D : arrays
         SI units. D is the feedthrough.
     q_tree, v_tree : (n,) arrays
@@ -116,6 +120,40 @@ class LinearModel(HasSummary):
         from ckc_pin.linear.mode_animation import animate_mode
 
         return animate_mode(self, number)
+
+    def plot(self) -> Figures:
+        """Draw poles and mode shapes. A notebook shows the figures and `save(folder)` writes them."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return A, B, C and D as one pandas DataFrame with names (needs the extra `data`).
+
+        It is the block matrix ``[[A, B], [C, D]]``. Each row is an equation: the rate of a state, ``d/dt v.theta_1``,
+        or an output, ``tip.x``. The columns are the states and then the inputs. ``frame.loc["tip.x", "theta_1"]`` is
+        an entry of C.
+        """
+        return to_data_frame("equation", *self._table("LinearModel.to_pandas"))
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the table of `to_pandas` as CSV, with all digits of each number.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or two states or inputs have the same name.
+        """
+        require_path(path, "LinearModel.to_csv: path")
+        write_atomic(Path(path), to_csv_text("equation", *self._table("LinearModel.to_csv")))
+        return Path(path)
+
+    def _table(self, where: str) -> tuple[tuple[str, ...], dict[str, Array]]:
+        """Return the names of the rows, and the columns by name."""
+        matrix = np.block([[self.A, self.B], [self.C, self.D]])
+        columns = zip((*self.states, *self.inputs), matrix.T, strict=True)
+        equations = (*(f"d/dt {state}" for state in self.states), *self.outputs)
+        return equations, require_distinct(columns, "equation", where)
 
     def to_statespace(self) -> Any:
         """Convert to a `control.StateSpace` of python-control.
@@ -315,15 +353,15 @@ def linear_model(
         mechanism=mechanism,
         at=at,
         t=t,
-        states=(*chart, *(f"{name}_dot" for name in chart)),
+        states=(*chart, *(f"v.{name}" for name in chart)),
         inputs=(
-            *mechanism.actuated,
+            *(f"tau.{motor}" for motor in mechanism.actuated),
             *(f"force.{force.name}.{component}" for force in forces for component in COMPONENTS),
         ),
         outputs=(
             *mechanism.coordinates,
-            *(f"point:{name}.{axis}" for name in points for axis in "xyz"),
-            *(f"loop:{loop}.{row}" for loop, row in mechanism.closure.names),
+            *(f"{name}.{axis}" for name in points for axis in "xyz"),
+            *(f"loop.{loop}.{row}" for loop, row in mechanism.closure.names),
         ),
         A=plant.A,
         B=np.hstack([plant.B, np.vstack([np.zeros((len(chart), push.shape[1])), plant.a_u[plant.at] @ push])]),

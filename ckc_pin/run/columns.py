@@ -1,15 +1,15 @@
-"""Names of the quantities of results, tables of them (data frame, CSV, xarray), and units of quantities and keys."""
+"""Names of the quantities of results, columns of tables, xarray datasets, and units of quantities and keys."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from io import StringIO
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.validation import describe_value, find_near_names
+from ckc_pin.base.tables import require_distinct, require_names
+from ckc_pin.base.validation import find_near_names
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import is_parameter
@@ -28,9 +28,6 @@ __all__ = [
     "list_columns",
     "list_quantities",
     "quantity_units",
-    "require_names",
-    "to_csv_text",
-    "to_data_frame",
     "to_dataset",
     "unknown_quantity",
 ]
@@ -184,21 +181,7 @@ def list_columns(run: Run, names: Sequence[str] | None = None, where: str = "Run
         if quantity.array == array
     ]
     columns += [(name, getattr(run, name)) for name in SCALARS if getattr(run, name) is not None]
-    by_name = dict(columns)
-    if len(by_name) < len(columns) or "t" in by_name:
-        all_names = [name for name, _ in columns]
-        duplicate = next((name for name in all_names if all_names.count(name) > 1), "t")
-        raise InputError(f"{run.scene_name}: two columns would be called {duplicate!r}; rename that joint")
-    return by_name
-
-
-def require_names(names: Any, where: str) -> list[str]:
-    """Return the names of a table's columns as a list; raise InputError for other values."""
-    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
-        raise InputError(
-            f'{where}: columns: expected a list of names, as ["theta_1", "tip.x"], got {describe_value(names)}'
-        )
-    return list(names)
+    return require_distinct(columns, "t", run.scene_name)
 
 
 def _select_named(run: Run, name: str, where: str) -> Array:
@@ -206,32 +189,6 @@ def _select_named(run: Run, name: str, where: str) -> Array:
     if values.ndim != 1:
         raise InputError(f"{where}: {name!r} is an array of several columns; name each of them")
     return values
-
-
-def to_csv_text(t: Array, columns: Mapping[str, Array]) -> str:
-    """Return a table as CSV with the columns t and `columns`. All digits of each number are written."""
-    import csv
-
-    text = StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["t", *columns])
-    writer.writerows(np.column_stack([t, *columns.values()]).tolist())
-    return text.getvalue()
-
-
-def to_data_frame(t: Array, columns: Mapping[str, Array]) -> Any:
-    """Return a table as a pandas DataFrame with the index t.
-
-    Raises
-    ------
-    InputError
-        pandas is not installed.
-    """
-    try:
-        import pandas
-    except ModuleNotFoundError:
-        raise InputError("to_pandas needs pandas: pip install 'ckc_pin[data]'") from None
-    return pandas.DataFrame(dict(columns), index=pandas.Index(t, name="t"))
 
 
 def to_dataset(run: Run) -> Any:

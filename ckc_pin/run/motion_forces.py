@@ -14,6 +14,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import open_atomic, write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary
+from ckc_pin.base.tables import require_names, to_csv_text, to_data_frame
 from ckc_pin.base.validation import describe_value, require_path
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -21,9 +22,6 @@ from ckc_pin.mechanism.units import motor_units
 from ckc_pin.run.columns import (
     Quantity,
     list_quantities,
-    require_names,
-    to_csv_text,
-    to_data_frame,
     unknown_quantity,
 )
 from ckc_pin.run.derived import DerivedQuantities
@@ -194,7 +192,7 @@ class MotionForces(HasSummary):
 
     def to_pandas(self, columns: Sequence[str] | None = None) -> pandas.DataFrame:
         """Return a pandas DataFrame by t with the columns of `to_csv` (needs the extra `data`)."""
-        return to_data_frame(self.t, self._list_columns(columns, "MotionForces.to_pandas"))
+        return to_data_frame("t", self.t, self._list_columns(columns, "MotionForces.to_pandas"))
 
     def to_csv(self, path: str | Path, columns: Sequence[str] | None = None) -> Path:
         """Write the motion and its forces as CSV, with all digits of each number.
@@ -211,7 +209,7 @@ class MotionForces(HasSummary):
             The file cannot be written, or a column is unknown.
         """
         require_path(path, "MotionForces.to_csv: path")
-        write_atomic(Path(path), to_csv_text(self.t, self._list_columns(columns, "MotionForces.to_csv")))
+        write_atomic(Path(path), to_csv_text("t", self.t, self._list_columns(columns, "MotionForces.to_csv")))
         return Path(path)
 
     def _list_columns(self, columns: Sequence[str] | None, where: str) -> dict[str, Array]:

@@ -16,6 +16,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
+from ckc_pin.base.tables import to_csv_text, to_data_frame
 from ckc_pin.base.validation import describe_value, is_number, require_path
 from ckc_pin.codegen.library import explain_too_large
 from ckc_pin.control.desired import Desired
@@ -32,8 +33,6 @@ from ckc_pin.run.columns import (
     list_columns,
     list_quantities,
     quantity_units,
-    to_csv_text,
-    to_data_frame,
     to_dataset,
     unknown_quantity,
 )
@@ -508,7 +507,7 @@ class Run(HasSummary):
 
     def to_pandas(self, columns: Sequence[str] | None = None) -> pandas.DataFrame:
         """Return a pandas DataFrame by t with the columns of `to_csv` (needs the extra `data`)."""
-        return to_data_frame(self.t, list_columns(self, columns, "Run.to_pandas"))
+        return to_data_frame("t", self.t, list_columns(self, columns, "Run.to_pandas"))
 
     def to_csv(self, path: str | Path, columns: Sequence[str] | None = None) -> Path:
         """Write the run as CSV, with all digits of each number.
@@ -527,7 +526,7 @@ class Run(HasSummary):
             The file cannot be written, a column is unknown, or a joint has the name of another column.
         """
         require_path(path, "Run.to_csv: path")
-        write_atomic(Path(path), to_csv_text(self.t, list_columns(self, columns)))
+        write_atomic(Path(path), to_csv_text("t", self.t, list_columns(self, columns)))
         return Path(path)
 
     # --- files -----------------------------------------------------------------------------------

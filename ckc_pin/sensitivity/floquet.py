@@ -190,7 +190,7 @@ def floquet(
     monodromy = np.concatenate([derivatives.q_tree[-1][q], derivatives.v_tree[-1][q]])
     multipliers = np.linalg.eigvals(monodromy).astype(np.complex128)
     order = np.argsort(-np.abs(multipliers), kind="stable")
-    states = (*names, *(f"{name}_dot" for name in names))
+    states = (*names, *(f"v.{name}" for name in names))
     uncertainty = _require_return(run, period) + scene.spec.solver.rtol
     reach = mechanism.tree.step_scale[q]
     scale = np.concatenate([reach, 2 * np.pi / period * reach])

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, lazy
-from ckc_pin.base.atomic_files import open_atomic
+from ckc_pin.base.atomic_files import open_atomic, write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
+from ckc_pin.base.tables import require_names, to_csv_text, to_data_frame
 from ckc_pin.base.validation import describe_value, require_callable, require_path, require_type, suggest_name
 from ckc_pin.control.controllers import ControlLaw, Controller
 from ckc_pin.control.sampled import Sampled
@@ -30,8 +31,14 @@ from ckc_pin.run.simulate import Progress, build_run, record_rows
 from ckc_pin.scene.scene import Scene, as_scene
 from ckc_pin.sensitivity.parameters import sensitivity_setup
 
+if TYPE_CHECKING:
+    import pandas
+
+    from ckc_pin.view.inline import Figures
+
 __all__ = ["Sensitivities", "compute_point_sensitivities", "sensitivities"]
 
+TABLE_ARRAYS = ("q_tree", "v_tree", "u", "tau", "point_positions")  # of the quantities whose derivatives are computed
 POINT_PREFIX = "point:"  # older names of points begin with it
 EXPECTED_NAMES = 'a list of names, as ["link.link_2.mass"]'
 
@@ -165,6 +172,64 @@ class Sensitivities(HasSummary):
             "end_time": None if self.end_time is None else self.end_time.tolist(),
             "stats": run.stats,
         }  # fmt: skip
+
+    # --- figures, export -------------------------------------------------------------------------
+
+    def plot(self) -> Figures:
+        """Draw the derivatives over time. A notebook shows the figure and `save(folder)` writes it."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def to_pandas(self, columns: Sequence[str] | None = None) -> pandas.DataFrame:
+        """Return a pandas DataFrame by t with a column for each quantity and parameter (needs the extra `data`).
+
+        Its columns have two levels: ``frame["theta_1"]`` has a column for each parameter, and
+        ``frame["theta_1", "link.rod.mass"]`` is one curve, as in ``result["theta_1", "link.rod.mass"]``.
+
+        Parameters
+        ----------
+        columns : sequence of str, optional
+            As for `to_csv`.
+        """
+        frame = to_data_frame("t", self.t, self._list_columns(columns, "Sensitivities.to_pandas"))
+        return frame.rename_axis(columns=["quantity", "parameter"])
+
+    def to_csv(self, path: str | Path, columns: Sequence[str] | None = None) -> Path:
+        """Write the derivatives as CSV, with all digits of each number.
+
+        The columns are t and one for each quantity and parameter, ``theta_1 by link.rod.mass``.
+
+        Parameters
+        ----------
+        path : str or Path
+        columns : sequence of str, optional
+            Names of quantities as in ``result[name]``. Default: coordinates, ``v.``, ``u.``, ``tau.`` and positions of
+            points.
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or a quantity is unknown or has no derivative here.
+        """
+        require_path(path, "Sensitivities.to_csv: path")
+        pairs = self._list_columns(columns, "Sensitivities.to_csv")
+        named = {f"{quantity} by {parameter}": values for (quantity, parameter), values in pairs.items()}
+        write_atomic(Path(path), to_csv_text("t", self.t, named))
+        return Path(path)
+
+    def _list_columns(self, columns: Sequence[str] | None, where: str) -> dict[tuple[str, str], Array]:
+        """Return the columns of the table by quantity and parameter."""
+        if columns is None:
+            quantities = list_quantities(self.run.mechanism).items()
+            names = [name for array in TABLE_ARRAYS for name, quantity in quantities if quantity.array == array]
+        else:
+            names = require_names(columns, where)
+        return {
+            (name, parameter): values
+            for name in names
+            for parameter, values in zip(self.parameters, self[name].T, strict=True)
+        }
 
     def save(self, path: str | Path) -> Path:
         """Write the derivatives to a file, NumPy's npz without pickle (docs/reference/run_file.md).

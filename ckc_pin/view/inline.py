@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+import sys
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ckc_pin.errors import InputError
+from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
 from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.run.run import Run
 from ckc_pin.sensitivity.sensitivities import Sensitivities
+from ckc_pin.view.ensemble_figures import draw_ensemble
 from ckc_pin.view.figures import draw_runs, write_figures
 from ckc_pin.view.gif import FRAMES_PER_SECOND, save_gif
 from ckc_pin.view.linear_figures import draw_linear
+from ckc_pin.view.map_figures import draw_map
 from ckc_pin.view.player import render_html, write_page
 from ckc_pin.view.result_figures import draw_motion_forces, draw_sensitivities
 
 if TYPE_CHECKING:
+    import xarray
     from matplotlib.figure import Figure
+
+    Drawable = Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | xarray.Dataset
 
 __all__ = ["Figures", "Playback"]
 
 PLAYBACK_HEIGHT_PX = 480
 FIGURE_DPI = 100
+DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap)
 
 
 class Figures(Mapping[str, "Figure"]):
@@ -35,7 +43,8 @@ class Figures(Mapping[str, "Figure"]):
 
     Parameters
     ----------
-    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities or MotionForces
+    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, or Dataset
+        of an ensemble
 
     Raises
     ------
@@ -43,7 +52,7 @@ class Figures(Mapping[str, "Figure"]):
         No result, another type, or a result that cannot be drawn together with others; matplotlib is not installed.
     """
 
-    def __init__(self, results: Sequence[Run | LinearModel | GainLocus | Sensitivities | MotionForces]) -> None:
+    def __init__(self, results: Sequence[Drawable]) -> None:
         match results:
             case [LinearModel() | GainLocus() as result]:
                 self._figures = draw_linear(result)
@@ -51,7 +60,16 @@ class Figures(Mapping[str, "Figure"]):
                 self._figures = {"sensitivities": draw_sensitivities(result)}
             case [MotionForces() as result]:
                 self._figures = {"inverse": draw_motion_forces(result)}
-            case _ if any(isinstance(x, LinearModel | GainLocus | Sensitivities | MotionForces) for x in results):
+            case [SingularityMap() as result]:
+                self._figures = {f"map_{result.space}": draw_map(result)}
+            case [result] if _is_dataset(result):
+                self._figures = draw_ensemble(result)  # type: ignore[arg-type]
+                if not self._figures:
+                    raise InputError(
+                        "plot: nothing to draw: outputs over time, and outputs of sweeps of one or two variables have "
+                        "figures; draw others with xarray"
+                    )
+            case _ if any(isinstance(x, DRAWN_ALONE) or _is_dataset(x) for x in results):
                 raise InputError("plot: only runs can be drawn together; give each other result alone")
             case _:
                 self._figures = draw_runs(results)  # type: ignore[arg-type]
@@ -138,6 +156,12 @@ class Playback:
         if size is not None or fps is not None:
             raise InputError("save: size and fps are those of a GIF; give a path that ends in .gif, or leave them out")
         return write_page(self.html, path)
+
+
+def _is_dataset(result: Any) -> bool:
+    """Return whether a result is an xarray Dataset, without importing xarray, which is optional."""
+    module = sys.modules.get("xarray")
+    return module is not None and isinstance(result, module.Dataset)
 
 
 def _render_image(name: str, figure: Figure) -> str:

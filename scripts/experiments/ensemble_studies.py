@@ -15,6 +15,7 @@ from ckc_pin.ensembles.sobol_indices import compute_sobol_indices
 from ckc_pin.ensembles.spec import parse_sweep
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.view.ensemble_figures import draw_basins, draw_quantiles, draw_sobol_indices
+from ckc_pin.view.layout import write_figure
 from scripts.experiments.certificate.certificate import certify, rest_height, sublevel_set
 from scripts.experiments.chart import shrink
 from scripts.experiments.paper.set_point_experiments import load_case
@@ -45,7 +46,8 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
     perturbed = ckc_pin.ensemble("five_bar/tracking", variables, outputs, members=members, seed=1, overrides=TRACKING)
     exact = ckc_pin.ensemble("five_bar/tracking", {"epsilon": [1e-3]}, outputs, overrides=TRACKING)
     change = perturbed["error"] - exact["error"][0]
-    draw_quantiles(change.rename("change of the error").assign_attrs(units="rad"), out / "tolerances_fan.png")
+    fan = draw_quantiles(change.rename("change of the error").assign_attrs(units="rad"))
+    write_figure(fan, out, "tolerances_fan", ("png",))
     lines = ["| joint | rms error, exact lengths (rad) | change by wrong lengths: 95 % stay below, the most (rad) |",
              "|---|---|---|"]  # fmt: skip
     for name in perturbed["independent"].to_numpy():

@@ -149,7 +149,7 @@ def test_a_sticking_joint_is_not_a_state(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, SET_POINT)
     model = linearize(scene, 0.4)
     assert model.locked == ("theta_1",)
-    assert model.states == ("theta_3", "theta_3_dot")
+    assert model.states == ("theta_3", "v.theta_3")
     controller, start = set_point(scene, mechanism), mechanism.kinematics(model.q_tree)
     q = mechanism.partition.q
 

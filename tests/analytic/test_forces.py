@@ -422,5 +422,5 @@ def test_multipliers_of_a_linear_model_answer_to_forces() -> None:
     for sign in (1, -1):
         force = {**WORLD, "force": [0.3 + sign * step, 0.5, 0.0]}
         ends.append(simulate("five_bar/swing", scene(force=[force], t_end=0.01)).loop_forces()["elbow"][0])
-    rows = [model.outputs.index(f"loop:elbow.{axis}") for axis in ("x", "y")]
+    rows = [model.outputs.index(f"loop.elbow.{axis}") for axis in ("x", "y")]
     assert_close(model.D[rows, 2], (ends[0] - ends[1]) / (2 * step), 1e-7)

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 from scipy.linalg import expm
 
@@ -16,8 +17,6 @@ from ckc_pin.linear.linear_model import linear_model
 from ckc_pin.mechanism.library import shipped
 from tests.analytic.five_bar import FIVE_BAR, Array, complex_step
 from tests.analytic.small_models import coupled_four_bar
-
-ANGLES = ("theta_1", "theta_3")
 
 
 def linearize_appendix(q_tree: Array, q_dot: Array, tau: Array) -> tuple[Array, Array, Array, Array]:
@@ -65,23 +64,41 @@ def test_the_model_at_any_state_matches_the_appendix(seed: int) -> None:
     for ours, theirs in zip((model.A, model.B, model.C[-2:], model.D[-2:]), (A, B, C, D), strict=True):
         agree(ours, theirs, 1e-10)
     agree(model.C[:4, :2], FIVE_BAR.rho(at.q_tree))
-    names = model.outputs.index("point:tip.x"), model.outputs.index("loop:elbow.x")
+    names = model.outputs.index("tip.x"), model.outputs.index("loop.elbow.x")
     assert names == (4, 7)
 
 
 def test_states_inputs_and_outputs_have_names() -> None:
     model = linearize("five_bar")
-    assert model.states == ("theta_1", "theta_3", "theta_1_dot", "theta_3_dot")
-    assert model.inputs == ANGLES
+    assert model.states == ("theta_1", "theta_3", "v.theta_1", "v.theta_3")
+    assert model.inputs == ("tau.theta_1", "tau.theta_3")
     assert model.outputs[:4] == ("theta_1", "theta_2", "theta_3", "theta_4")
-    assert model.outputs[4:] == ("point:tip.x", "point:tip.y", "point:tip.z", "loop:elbow.x", "loop:elbow.y")
+    assert model.outputs[4:] == ("tip.x", "tip.y", "tip.z", "loop.elbow.x", "loop.elbow.y")
     assert len(repr(model).splitlines()) == 5
     plant = model.to_statespace()
-    assert plant.state_labels == list(model.states)
-    assert plant.input_labels == list(model.inputs)
-    assert plant.output_labels[-1] == "loop:elbow_y"
+    assert plant.state_labels == ["theta_1", "theta_3", "v_theta_1", "v_theta_3"]
+    assert plant.input_labels == ["tau_theta_1", "tau_theta_3"]
+    assert plant.output_labels[-1] == "loop_elbow_y"
     agree(plant.A, model.A)
     agree(np.sort(plant.poles().imag), np.sort(model.eigenvalues.imag))
+
+
+def test_table_of_matrices_has_a_name_for_each_row_and_column(tmp_path: Path) -> None:
+    model = linearize("five_bar", {"theta_1": 1.9, "theta_3": 1.2})
+    frame = model.to_pandas()
+    assert list(frame.columns) == ["theta_1", "theta_3", "v.theta_1", "v.theta_3", "tau.theta_1", "tau.theta_3"]
+    assert list(frame.index[:4]) == ["d/dt theta_1", "d/dt theta_3", "d/dt v.theta_1", "d/dt v.theta_3"]
+    assert tuple(frame.index[4:]) == model.outputs
+    A, B, C, D = linearize_appendix(model.q_tree, np.zeros(2), model.tau)
+    accelerations, forces = ["d/dt v.theta_1", "d/dt v.theta_3"], ["loop.elbow.x", "loop.elbow.y"]
+    states, inputs = list(model.states), list(model.inputs)
+    agree(frame.loc[accelerations, states].to_numpy(), A[2:], 1e-9)
+    agree(frame.loc[accelerations, inputs].to_numpy(), B[2:], 1e-9)
+    agree(frame.loc[forces, states].to_numpy(), C, 1e-9)
+    agree(frame.loc[forces, inputs].to_numpy(), D, 1e-9)
+    file = pandas.read_csv(model.to_csv(tmp_path / "model.csv"), index_col="equation")
+    assert file.equals(frame)
+    assert repr(model.plot()) == "Figures(poles, modes)"
 
 
 def test_names_for_python_control_are_distinct(tmp_path: Path) -> None:
@@ -195,7 +212,7 @@ def test_dry_friction_is_smoothed_or_locks_its_joint(tmp_path: Path) -> None:
     free = linearize(str(_write_scene(coupled_four_bar(tmp_path / "smooth"), tmp_path / "smooth")))
     smooth = linearize(scene, overrides={"friction_smoothing": smoothing})
     extra = -free.B[1, 0] * 0.3 / smoothing  # -F / s acts on the crank, as the motor does
-    assert smooth.inputs == ("crank",)
+    assert smooth.inputs == ("tau.crank",)
     agree(smooth.A - free.A, np.array([[0, 0], [0, extra]]), 1e-9)
     assert smooth.modes[0].frequency == 0.0, "overdamped"
 
@@ -207,7 +224,7 @@ def test_a_locked_joint_is_not_a_state() -> None:
     state = Terms(mechanism, at, at.rho @ [0.0, q_dot])
     model = linear_model(state, np.array([0.3, 0.2]), at="somewhere", locked=np.array([0]))
     assert model.locked == ("theta_1",)
-    assert model.states == ("theta_3", "theta_3_dot")
+    assert model.states == ("theta_3", "v.theta_3")
 
     def acceleration(x: Array) -> Array:
         """Acceleration of theta_3 after steps in theta_3, its rate and its torque."""

@@ -1,6 +1,7 @@
 """The singularity map of the five-bar against closed forms of its geometry."""
 
 import numpy as np
+import pandas
 import pytest
 
 from ckc_pin import InputError, load
@@ -47,6 +48,32 @@ def test_reached_cells_are_where_two_circles_meet(joint):
     for aspect in result.aspects:
         assert np.array_equal(aspect.reached[sure], inside[sure])
         assert np.mean(aspect.reached != inside) < 2e-3
+
+
+def test_table_has_the_closed_configurations_and_their_measures(joint, tmp_path):
+    result, model = joint
+    frame = result.to_pandas()
+    angles = [f"theta_{k}" for k in (1, 2, 3, 4)]
+    assert list(frame.columns) == [*angles, "tip.x", "tip.y", "tip.z", "sigma_min", "det_phi_z"]
+    assert frame.index.value_counts().to_dict() == {k + 1: x.reached.sum() for k, x in enumerate(result.aspects)}
+    for row in frame.sample(50, random_state=1).itertuples():
+        q_tree = np.array([getattr(row, name) for name in angles])
+        phi_z = model.phi_z(q_tree)
+        assert_close(model.phi(q_tree), 0.0, 1e-9)
+        assert_close(row.det_phi_z, np.linalg.det(phi_z), 1e-9)
+        assert_close(row.sigma_min, np.linalg.norm(phi_z, -2), 1e-9)
+    file = pandas.read_csv(result.to_csv(tmp_path / "map.csv"), index_col="branch")
+    assert file.equals(frame)
+    assert repr(result.plot()) == "Figures(map_joint)"
+
+
+def test_table_of_a_map_over_places_has_the_cells(cartesian):
+    result, _ = cartesian
+    frame = result.to_pandas().loc[1]
+    first, second = np.nonzero(result.aspects[0].reached)
+    assert_close(frame["tip.x"], result.axes[0].values[first], 1e-8)
+    assert_close(frame["tip.y"], result.axes[1].values[second], 1e-8)
+    assert repr(result.plot()) == "Figures(map_cartesian)"
 
 
 def test_det_phi_z_is_twice_the_area_of_the_distal_links_triangle(joint):

@@ -67,12 +67,11 @@ def test_basin_figure_shows_every_member(drawn):
     assert ax.get_ylabel() == "key"
 
 
-def test_quantile_figure_has_bands_and_units(drawn):
+def test_quantile_figure_has_bands_and_units():
     values = np.arange(101.0)[:, np.newaxis, np.newaxis] * np.ones((1, 2, 5))
     x = xr.DataArray(values, dims=("member", "coordinate", "time"), name="error", attrs={"units": "rad"},
                      coords={"coordinate": ["theta_1", "theta_3"], "time": np.linspace(0, 1, 5)})  # fmt: skip
-    ensemble_figures.draw_quantiles(x, Path("fan.png"))
-    upper, lower = drawn[0].axes
+    upper, lower = ensemble_figures.draw_quantiles(x).axes
     assert [ax.get_ylabel() for ax in (upper, lower)] == [r"$\theta_{1}$ (rad)", r"$\theta_{3}$ (rad)"]
     assert lower.get_xlabel() == "$t$ (s)"
     heights = [sorted(set(band.get_paths()[0].vertices[:, 1].tolist())) for band in upper.collections]

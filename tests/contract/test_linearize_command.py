@@ -30,8 +30,8 @@ def test_json_has_labels_and_matrices() -> None:
     model = linearize("five_bar")
     for name in "ABCD":
         assert np.array_equal(result[name], getattr(model, name))
-    assert result["states"] == ["theta_1", "theta_3", "theta_1_dot", "theta_3_dot"]
-    assert result["inputs"] == ["theta_1", "theta_3"]
+    assert result["states"] == ["theta_1", "theta_3", "v.theta_1", "v.theta_3"]
+    assert result["inputs"] == ["tau.theta_1", "tau.theta_3"]
     assert [complex(*x) for x in result["eigenvalues"]] == model.eigenvalues.tolist()
     assert result["at"]["q_tree"] == model.q_tree.tolist()
     assert result["at"]["t"] is None

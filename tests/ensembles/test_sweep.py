@@ -64,7 +64,7 @@ def test_a_sweep_prints_counts_and_writes_results_for_xarray(tmp_path: Path) -> 
     assert dict(result.sizes) == {"member": 40, "coordinate": 4, "time": 3}
     assert result["coordinate"].to_numpy().tolist() == ["theta_1", "theta_2", "theta_3", "theta_4"]
     assert result["end"].sel(coordinate="theta_1").to_numpy().tolist() == result["path"][:, -1].to_numpy().tolist()
-    assert {path.name for path in (tmp_path / "o").glob("*.png")} == {"path.png", "drift.png"}
+    assert {path.name for path in (tmp_path / "o").glob("*.png")} == {"path.png", "drift.png", "end.png"}
     worst = int(np.argmax(result["drift"].to_numpy()))
     run = ckc_pin.Run.load(tmp_path / "o" / f"worst_drift_{worst}")
     assert np.allclose(run.q_tree[-1], result["end"][worst], atol=1e-9)

@@ -263,6 +263,7 @@ def make_map(
     values = grids[0].values[np.flatnonzero(grids[0].reached)[0]]
     return SingularityMap(
         mechanism=mechanism.name,
+        coordinates=mechanism.coordinates,
         space=space,
         point=extended.point,
         axes=domain.axes,
@@ -295,15 +296,22 @@ def _make_aspect(extended: ExtendedClosure, grid: Grid, is_square: bool) -> Aspe
     mechanism, shape = extended.mechanism, grid.domain.shape
     inside = np.flatnonzero(grid.reached)
     phi_z = grid.J[inside][:, : len(extended.loops)][:, :, mechanism.partition.z]
-    det = np.full(len(grid.reached), np.nan)
-    det[inside] = np.linalg.det(phi_z) if is_square else np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+    sigma_min, det = np.full(len(grid.reached), np.nan), np.full(len(grid.reached), np.nan)
+    sigma_min[inside] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+    det[inside] = np.linalg.det(phi_z) if is_square else sigma_min[inside]
+    coordinates = grid.q_tree
+    if not mechanism.tree.is_euclidean:
+        coordinates = np.full((len(grid.reached), mechanism.n), np.nan)
+        coordinates[inside] = [mechanism.tree.to_coordinates(q_tree) for q_tree in grid.q_tree[inside]]
     positions = np.full((len(grid.reached), 3), np.nan)
     if extended.point is not None:
         positions[inside] = _point_positions(extended, grid.q_tree[inside])
     return Aspect(
         reached=grid.reached.reshape(shape),
         det_phi_z=det.reshape(shape),
+        sigma_min=sigma_min.reshape(shape),
         q_tree=grid.q_tree.reshape(*shape, -1),
+        coordinates=coordinates.reshape(*shape, -1),
         point=None if extended.point is None else positions.reshape(*shape, 3),
     )
 
