@@ -33,6 +33,8 @@ FORMATS = ("png", "svg", "pdf")
 TITLES = {
     "set_point": "set-point control",
     "tracking": "tracking control",
+    "servo": "joint servos",
+    "prescribed": "prescribed joints",
     "own": "own controller",
     "motion": "motion without control",
 }
@@ -60,7 +62,8 @@ def plot_runs(runs: Run | Sequence[Run], out_dir: str | Path, formats: Sequence[
     Returns
     -------
     list of Path
-        The files. Their names are ``set_point``, ``tracking``, ``own`` or ``motion``, alone and with suffixes:
+        The files. Their names are ``set_point``, ``tracking``, ``servo``, ``prescribed``, ``own`` or ``motion``, alone
+        and with suffixes:
         ``_snapshots``; for controlled runs ``_checks``, which shows whether to trust a run; and ``_coordinates`` and
         ``_efforts`` with a small panel for each, if there are more than colours.
 
@@ -120,7 +123,12 @@ def _group_runs(runs: Iterable[Run]) -> list[RunGroup]:
     for run in runs:
         controller = run.scene.get("controller")
         law = controller["type"] if controller else "torques"
-        kind = str(law) if law != "torques" else "own" if np.any(run.tau) else "motion"
+        if run.scene.get("prescribed") and (law == "torques" or not run.independent):
+            kind = "prescribed"
+        elif law != "torques":
+            kind = "servo" if law == "joint_servo" else str(law)
+        else:
+            kind = "own" if np.any(run.tau) else "motion"
         members.setdefault((kind, run.mechanism.name, run.coordinates, run.independent, run.actuated), []).append(run)
     groups = []
     for (kind, *_), group_runs in members.items():
@@ -183,10 +191,21 @@ def _draw_tracking(group: RunGroup) -> Figure:
     return slots[0].figure
 
 
+def _draw_prescribed(group: RunGroup) -> Figure:
+    """Draw a motion with prescribed joints: coordinates, rates, torques, energy."""
+    names = _list_panel_coordinates(group)
+    slots = _create_page(group, ["coordinates", "velocities", _efforts_title(group), "energy"])
+    panels.draw_coordinates(slots[0], group, names)
+    panels.draw_rates(slots[1], group, names)
+    panels.draw_efforts(slots[2], group, group.runs[0].actuated, _describe_peaks(group))
+    panels.draw_scalar(slots[3], group, lambda run: run.energy, axis_label("$E$", "J"))
+    _add_legend(slots[0].figure, group, list(dict.fromkeys([*names, *group.runs[0].actuated])))
+    return slots[0].figure
+
+
 def _draw_motion(group: RunGroup) -> Figure:
     """Draw a motion without control: coordinates, rates, change of energy, closure residual."""
-    coordinates = group.runs[0].coordinates
-    names = coordinates if len(coordinates) <= MAX_PANEL_COORDINATES else group.independent
+    names = _list_panel_coordinates(group)
     is_smooth = group.mechanism.joints.has_smooth_friction(group.runs[0].scene.get("friction_smoothing"))
     is_damped = group.mechanism.springs.any_damping or group.runs[0].dissipated is not None or is_smooth
     energy_title = f"energy {'change' if is_damped else 'drift'}"
@@ -240,7 +259,7 @@ def _draw_small_panels(group: RunGroup) -> dict[str, Figure]:
     """Draw a small panel for each coordinate and each motor, if there are more of them than colours."""
     from matplotlib import rc_context
 
-    coordinates = group.runs[0].coordinates if group.kind == "motion" else group.independent
+    coordinates = group.runs[0].coordinates if group.draws_all_coordinates else group.independent
     motors = group.runs[0].actuated if group.kind != "motion" else ()
     kinds: dict[str, tuple[Sequence[str], Callable[[PanelSlot, RunGroup, Sequence[str]], None]]] = {
         "coordinates": (coordinates, panels.draw_coordinates),
@@ -267,7 +286,14 @@ def _draw_small_panels(group: RunGroup) -> dict[str, Figure]:
     return figures
 
 
-_LAYOUTS = {"set_point": _draw_set_point, "tracking": _draw_tracking, "own": _draw_tracking, "motion": _draw_motion}
+_LAYOUTS = {
+    "set_point": _draw_set_point,
+    "tracking": _draw_tracking,
+    "servo": _draw_tracking,
+    "prescribed": _draw_prescribed,
+    "own": _draw_tracking,
+    "motion": _draw_motion,
+}
 
 
 # --- parts ---------------------------------------------------------------------------------------
@@ -300,6 +326,12 @@ def _simplify_axes(figure: Figure, columns: int) -> None:
             ax.set_ylim(0.5 * (low + high - min_span), 0.5 * (low + high + min_span))
         if k + columns < len(figure.axes):
             ax.set_xlabel("")
+
+
+def _list_panel_coordinates(group: RunGroup) -> tuple[str, ...]:
+    """Return all coordinates for a panel, or the independent ones if there are too many and some are independent."""
+    coordinates = group.runs[0].coordinates
+    return coordinates if len(coordinates) <= MAX_PANEL_COORDINATES else group.independent or coordinates
 
 
 def _efforts_title(group: RunGroup) -> str:

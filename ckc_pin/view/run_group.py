@@ -83,7 +83,9 @@ class RunGroup:
 
     Attributes
     ----------
-    kind : "set_point", "tracking", "own" (a controller written in Python) or "motion" (no control)
+    kind : "set_point", "tracking", "servo", "prescribed", "own" or "motion"
+        Of control. "prescribed" has prescribed joints and no controller, "own" a controller written in Python, and
+        "motion" no control.
     runs : list of Run
         In drawing order.
     desired_paths : list of DesiredPath or None
@@ -123,12 +125,18 @@ class RunGroup:
         outcomes = ["" if r.status == "done" else f" ({r.status} at {r.t[-1]:.4g} s)" for r in self.runs]
         return [escape_mathtext(label) + text for label, text in zip(label_runs(self.runs), outcomes, strict=True)]
 
+    @property
+    def draws_all_coordinates(self) -> bool:
+        """Whether dependent coordinates have curves, too: in motions without a controller."""
+        return self.kind in ("motion", "prescribed")
+
     @cached_property
     def curve_names(self) -> list[str]:
-        """Coordinates and motors with curves: all coordinates without control, else independent ones and motors."""
+        """Coordinates and motors with curves: all coordinates or independent ones, and motors unless they are off."""
         run = self.runs[0]
-        dependent = [name for name in run.coordinates if name not in self.independent]
-        return list(dict.fromkeys([*self.independent, *(dependent if self.kind == "motion" else run.actuated)]))
+        dependent = run.coordinates if self.draws_all_coordinates else ()
+        motors = run.actuated if self.kind != "motion" else ()
+        return list(dict.fromkeys([*self.independent, *dependent, *motors]))
 
     @cached_property
     def colours(self) -> dict[str, str]:
