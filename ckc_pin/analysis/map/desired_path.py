@@ -9,6 +9,7 @@ import numpy as np
 
 from ckc_pin.analysis.map.grid import Domain, Grid
 from ckc_pin.analysis.map.loci import find_aspects
+from ckc_pin.analysis.map.nearest import find_nearest_singular
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
@@ -77,7 +78,7 @@ def add_path(
     loci: Sequence[Locus],
     is_cartesian: bool,
 ) -> Path:
-    """Return a desired trajectory as a path in a map, with its closest approach to each locus."""
+    """Return a desired trajectory as a path in a map, with its closest approach to each locus and in all of q."""
     desired, t, check, domain = trajectory.desired, trajectory.t, trajectory.check, grids[0].domain
     if check.leaves_at is not None and is_cartesian:
         t = t[t <= check.leaves_at]
@@ -102,6 +103,7 @@ def add_path(
         closest_t=check.closest_t,
         sigma_min=check.sigma_min,
         approaches=tuple(sorted((a for a in approaches if a is not None), key=lambda a: a.distance)),
+        nearest=None if check.leaves_at is not None else find_nearest_singular(mechanism, desired, t),
     )
 
 
