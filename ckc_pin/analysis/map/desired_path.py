@@ -63,7 +63,9 @@ def read_desired(scene: Scene, mechanism: Mechanism) -> DesiredTrajectory:
         check = DesiredCheck(None, 0.0, controller.target.at.sigma_min())
         return DesiredTrajectory(scene.name, lambda t: (target, zero, zero), np.zeros(1), check)
     if not isinstance(controller, Tracking):
-        raise InputError(f"--scene {scene.name}: it has no desired trajectory; name a scene with a controller")
+        raise InputError(
+            f"--scene {scene.name}: it has no desired trajectory; name a scene with set-point or tracking control"
+        )
     check = follow_desired(mechanism, controller.desired, scene.spec.t_end)
     t = np.linspace(0.0, scene.spec.t_end, SAMPLES + 1)
     if check.leaves_at is not None and isinstance(controller.desired, PointPath):
