@@ -286,7 +286,7 @@ def _save_sensitivities(result: ckc_pin.Sensitivities, out: Path, figures: bool)
     "--scene",
     metavar="SCENE",
     shell_complete=options.complete_scenes,
-    help="Also draw the desired trajectory of this scene.",
+    help="Also draw the desired trajectory of this scene and measure how near it comes to singular configurations.",
 )
 @click.option("--over", metavar="A,B", help="Coordinates of the axes; the others are fixed.")
 @click.option(

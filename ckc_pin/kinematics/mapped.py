@@ -19,7 +19,18 @@ if TYPE_CHECKING:
 
     from ckc_pin.view.inline import Figures
 
-__all__ = ["LABELS", "Approach", "Aspect", "Axis", "Kind", "Locus", "Path", "SingularityMap", "Space"]
+__all__ = [
+    "LABELS",
+    "Approach",
+    "Aspect",
+    "Axis",
+    "Kind",
+    "Locus",
+    "NearestSingular",
+    "Path",
+    "SingularityMap",
+    "Space",
+]
 
 Space = Literal["joint", "cartesian"]
 Kind = Literal["locked", "fold", "rank loss", "serial"]
@@ -127,7 +138,8 @@ class Approach:
     """The closest approach of a trajectory to a locus, in the units of the map.
 
     The distance is measured over the axes of the map. If the map has fixed coordinates, both are within its section:
-    the locus of other sections may be nearer, and the trajectory need not be in the section.
+    the locus of other sections may be nearer, and the trajectory need not be in the section. `NearestSingular` is
+    measured in all of q.
 
     Attributes
     ----------
@@ -143,6 +155,32 @@ class Approach:
     t: float
     at: Array
     to: Array
+
+
+@dataclass(frozen=True)
+class NearestSingular:
+    """The singular configuration on a trajectory's assembly branch that is nearest to the trajectory in all of q.
+
+    Attributes
+    ----------
+    kind : "locked", "fold" or "rank loss"
+        phi_z is singular there.
+    distance : float
+        Smallest |q_s - q_d(t)|.
+    unit : "rad", "m" or "rad or m"
+        Of the independent coordinates, whose squares are added without weights.
+    t : float
+        s.
+    q_d, q : (d,) arrays
+        The trajectory at t, and the singular configuration q_s, in `independent` order.
+    """
+
+    kind: Kind
+    distance: float
+    unit: str
+    t: float
+    q_d: Array
+    q: Array
 
 
 @dataclass(frozen=True)
@@ -162,6 +200,8 @@ class Path:
         Time at which phi_z is closest to singular, and its smallest singular value then.
     approaches : tuple of Approach
         The closest approach to each locus, the nearest first.
+    nearest : NearestSingular or None
+        None if the trajectory leaves the workspace, or if none was found.
     """
 
     name: str
@@ -172,6 +212,7 @@ class Path:
     closest_t: float
     sigma_min: float
     approaches: tuple[Approach, ...]
+    nearest: NearestSingular | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -284,6 +325,16 @@ class SingularityMap(HasSummary):
                     }
                     for a in path.approaches
                 ],
+                "nearest": None
+                if path.nearest is None
+                else {
+                    "kind": path.nearest.kind,
+                    "distance": path.nearest.distance,
+                    "unit": path.nearest.unit,
+                    "t": path.nearest.t,
+                    "q_d": path.nearest.q_d.tolist(),
+                    "q": path.nearest.q.tolist(),
+                },
             },
             "seconds": self.seconds,
             "notes": list(self.notes),

@@ -9,6 +9,7 @@ import pytest
 
 from ckc_pin import check, load_scene, simulate
 from ckc_pin.control.controllers import SetPoint, Tracking
+from ckc_pin.control.spec import SetPointSpec, TrackingSpec
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.linear.closed_loop import ClosedLoop
@@ -25,7 +26,8 @@ CONTROLLED = [
     name
     for mechanism in shipped()
     for scene in list_scene_names(mechanism)
-    if load_scene(name := f"{mechanism}/{scene}").spec.controller is not None and name not in LEAVES
+    if isinstance(load_scene(name := f"{mechanism}/{scene}").spec.controller, SetPointSpec | TrackingSpec)
+    and name not in LEAVES
 ]
 MIN_TIME_CONSTANTS = 4  # duration of a shipped scene, in time constants of the slowest decay: errors fall to 2 %
 

@@ -127,3 +127,26 @@ def test_paper_is_cited_for_its_scenes_only(stewart):
     other = draw_runs(ckc_pin.simulate("delta/circle", {"t_end": 0.02}))["tracking"]
     words = " ".join([*(text.get_text() for text in other.texts), *(ax.get_title(loc="left") for ax in other.axes)])
     assert not {"eq.", "paper", "Fig."} & set(words.replace(",", " ").split())
+
+
+def test_prescribed_joints_are_drawn_with_all_coordinates_and_the_torque():
+    """The crank was the only freedom, so no coordinate is independent."""
+    run = ckc_pin.simulate("slider_crank/driven", {"t_end": 0.1})
+    figures = draw_runs(run)
+    assert list(figures) == ["prescribed", "prescribed_checks", "prescribed_snapshots"]
+    energy, torque, angles, position, angle_rates, rate = figures["prescribed"].axes
+    for ax, names in ((angles, ["crank", "rod"]), (position, ["slider"]), (angle_rates, ["v.crank", "v.rod"]),
+                      (rate, ["v.slider"]), (torque, ["tau.crank"]), (energy, ["energy"])):  # fmt: skip
+        for (_, values), name in zip(lines(ax), names, strict=True):
+            np.testing.assert_array_equal(values, run[name], err_msg=name)
+
+
+def test_joint_servos_are_drawn_in_the_phase_plane_with_their_torque():
+    run = ckc_pin.simulate("four_bar/servo", {"t_end": 0.1})
+    figures = draw_runs(run)
+    assert list(figures) == ["joint_servo", "joint_servo_checks", "joint_servo_snapshots"]
+    plane, torque, angle, rate = figures["joint_servo"].axes
+    x, y = lines(plane)[0]
+    np.testing.assert_array_equal([x, y], [run["crank"], run["v.crank"]])
+    for ax, name in ((torque, "tau.crank"), (angle, "crank"), (rate, "v.crank")):
+        np.testing.assert_array_equal(lines(ax)[0][1], run[name], err_msg=name)

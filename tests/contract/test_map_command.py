@@ -90,13 +90,15 @@ def test_folder_that_is_a_file_is_refused(tmp_path):
 
 
 def test_distances_of_a_section_are_said_to_be_within_it():
-    """Of three freedoms two are axes, so the locus of another a_3 may be nearer; of two freedoms none is fixed."""
+    """Of three freedoms two are axes, and the motion is not in the section; of two freedoms none is fixed."""
     section = ckc("map", "three_rrr", "--cells", "16", "--scene", "circle")
     assert "within section (rad)" in section.out
-    assert "within this section (a_3 = 3.514): in all of q" in " ".join(section.out.split())
+    assert "over the axes only, within this section (a_3 = 3.514)." in " ".join(section.out.split())
+    assert "nearest singular phi_z in all of q: 0.166347 rad, type 2, at t =" in " ".join(section.out.split())
     whole = ckc("map", "five_bar", "--cells", "16", "--scene", "set_point")
     assert "distance (rad)" in whole.out
     assert "section" not in whole.out
+    assert "in all of q: 0.939215 rad, type 2, at t = 0.00000 s from desired" in " ".join(whole.out.split())
     for words, within in (("three_rrr", "circle"), True), (("five_bar", "set_point"), False):
         name, scene = words
         assert ckc("map", name, "--cells", "16", "--scene", scene, "--json").json["desired"]["within_section"] is within

@@ -52,7 +52,8 @@ def five_bar() -> Mechanism:
 def scene_from_python(name: str, scene: str) -> Scene:
     """Return a shipped scene without its files, where these are not CSV files."""
     keys = tomllib.loads((library() / name / f"{scene}.scene.toml").read_text())
-    return Scene(mechanism_from_python(name, keys.pop("mechanism")), events=keys.pop("event", ()), **keys)
+    mechanism = mechanism_from_python(name, keys.pop("mechanism"))
+    return Scene(mechanism, events=keys.pop("event", ()), forces=keys.pop("force", ()), **keys)
 
 
 def assert_same_runs(run: Run, other: Run) -> None:

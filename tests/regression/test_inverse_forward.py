@@ -11,6 +11,7 @@ import pytest
 import ckc_pin
 from ckc_pin import InputError, Mechanism, MotionForces, Terms, inverse_dynamics
 from ckc_pin.control.desired import Table
+from ckc_pin.control.spec import SetPointSpec, TrackingSpec
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.scene.names import list_scene_names
 from ckc_pin.scene.parts import load_scene_mechanism
@@ -22,7 +23,7 @@ CONTROLLED = [
     f"{mechanism}/{scene}"
     for mechanism in shipped()
     for scene in list_scene_names(mechanism)
-    if ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller is not None
+    if isinstance(ckc_pin.load_scene(f"{mechanism}/{scene}").spec.controller, SetPointSpec | TrackingSpec)
 ]
 T_END = {"andrews": 0.01}  # s; open-loop errors grow by e in 2 ms there, and rounding differs between machines
 AT_REST = 1e-12  # relative to the fastest coordinate; rounding of a rate that is zero, as at a reversal

@@ -9,6 +9,7 @@ import numpy as np
 
 from ckc_pin.analysis.map.grid import Domain, Grid
 from ckc_pin.analysis.map.loci import find_aspects
+from ckc_pin.analysis.map.nearest import find_nearest_singular
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.control.controllers import SetPoint, Tracking
 from ckc_pin.control.desired import Desired
@@ -62,7 +63,9 @@ def read_desired(scene: Scene, mechanism: Mechanism) -> DesiredTrajectory:
         check = DesiredCheck(None, 0.0, controller.target.at.sigma_min())
         return DesiredTrajectory(scene.name, lambda t: (target, zero, zero), np.zeros(1), check)
     if not isinstance(controller, Tracking):
-        raise InputError(f"--scene {scene.name}: it has no desired trajectory; name a scene with a controller")
+        raise InputError(
+            f"--scene {scene.name}: it has no desired trajectory; name a scene with set-point or tracking control"
+        )
     check = follow_desired(mechanism, controller.desired, scene.spec.t_end)
     t = np.linspace(0.0, scene.spec.t_end, SAMPLES + 1)
     if check.leaves_at is not None and isinstance(controller.desired, PointPath):
@@ -77,7 +80,7 @@ def add_path(
     loci: Sequence[Locus],
     is_cartesian: bool,
 ) -> Path:
-    """Return a desired trajectory as a path in a map, with its closest approach to each locus."""
+    """Return a desired trajectory as a path in a map, with its closest approach to each locus and in all of q."""
     desired, t, check, domain = trajectory.desired, trajectory.t, trajectory.check, grids[0].domain
     if check.leaves_at is not None and is_cartesian:
         t = t[t <= check.leaves_at]
@@ -102,6 +105,7 @@ def add_path(
         closest_t=check.closest_t,
         sigma_min=check.sigma_min,
         approaches=tuple(sorted((a for a in approaches if a is not None), key=lambda a: a.distance)),
+        nearest=None if check.leaves_at is not None else find_nearest_singular(mechanism, desired, t),
     )
 
 

@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from ckc_pin.kinematics.mapped import LABELS, Locus, Path, SingularityMap
+from ckc_pin.kinematics.mapped import LABELS, Locus, NearestSingular, Path, SingularityMap
 
 __all__ = ["make_map_table", "make_sections_table", "sections_to_dict"]
 
@@ -113,13 +113,19 @@ def _path_table(result: SingularityMap, path: Path) -> list[Any]:
     parts: list[Any] = [Text(f"desired, {path.name}: {outcome}"), table]
     if result.fixed:
         fixed = ", ".join(f"{name} = {x:.4g}" for name, x in result.fixed.items())
-        parts.append(
-            Text(
-                f"Distances are over the axes only, within this section ({fixed}): in all of q the locus may be nearer "
-                "or further away. sigma_min(phi_z) is that of the motion itself."
-            )
-        )
+        parts.append(Text(f"Distances in this table are over the axes only, within this section ({fixed})."))
+    if path.leaves_at is None:
+        parts.append(Text(f"nearest singular phi_z in all of q: {_describe_nearest(path.nearest)}"))
     return parts
+
+
+def _describe_nearest(nearest: NearestSingular | None) -> str:
+    if nearest is None:
+        return "none was found"
+    desired, singular = ("(" + ", ".join(f"{x:.5f}" for x in q) + ")" for q in (nearest.q_d, nearest.q))
+    label = LABELS[nearest.kind].partition(":")[0]
+    where = f"at t = {nearest.t:.5f} s from desired {desired} to {singular}"
+    return f"{nearest.distance:.6f} {nearest.unit}, {label}, {where}"
 
 
 def _wrap(angle: float) -> float:
