@@ -249,7 +249,10 @@ def law_table(controller: Controller | TorqueController) -> dict[str, Any] | Non
             "servos": controller.servo_tables(),
             "desired": _desired(controller.desired),
         }
-        return {**servos, "gravity": actuation_table(controller.balance)} if controller.gravity else servos
+        if controller.gravity:
+            balance = actuation_table(controller.balance)
+            servos["gravity"] = {**balance, "limit": np.full(len(balance["limit"]), np.inf)}
+        return servos
     desired = _desired(controller.desired) if type(controller) is Tracking else None
     if type(controller) is not Tracking or desired is None:
         return None

@@ -13,6 +13,7 @@ from ckc_pin.control.controllers import (
     Tracking,
     is_torque_controller,
 )
+from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.sampled import Sampled, unwrap_sampled
 from ckc_pin.control.spec import SetPointSpec
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
@@ -76,6 +77,9 @@ def require_runnable(
     if mechanism.d:
         require_mass(Terms(mechanism, start.at, np.zeros(mechanism.n)), start.at.rho, start.at.partition.q)
     law = unwrap_sampled(controller)
+    has_gravity = isinstance(law, JointServo) and law.gravity
+    if has_gravity and (reason := actuation.explain_undriven_freedoms(start.at)):
+        raise InputError(f"controller.gravity: the motors cannot balance it: {reason}")
     if law is not None and not is_torque_controller(law):
         require_chart(mechanism, start)
         actuation.require_driven_freedoms(start.at)

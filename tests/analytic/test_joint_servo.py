@@ -177,6 +177,35 @@ def test_gravity_is_balanced_at_the_start() -> None:
     assert_close(run.tau[-1], FIVE_BAR.h(FIVE_BAR.sigma(START)), 1e-8)
 
 
+@pytest.mark.parametrize("limit", [None, 0.5])
+def test_gravity_is_shared_by_redundant_motors_as_the_reference_says(limit: float | None) -> None:
+    """Torques along a run against those of the class in Python, which does not share code with the core."""
+    joint = "left_shoulder_lift_joint"
+    motor = {joint: {"K_P": 20.0, "K_D": 2.0, "desired": {"offset": -1.0}}}
+    controller = {"type": "joint_servo", "gravity": True, "motor": motor, "torque_limit": limit}
+    overrides = {"controller": {k: x for k, x in controller.items() if x is not None}, "t_end": 0.05}
+    run = simulate("two_ur5/lift", {**overrides, "solver.rtol": 1e-9})
+    servo = JointServo(run.mechanism, motor, gravity=True)
+    for k in range(0, len(run.t), 100):
+        tau = servo.tau(float(run.t[k]), run.sel(t=float(run.t[k])).terms)
+        tau = tau if limit is None else np.clip(tau, -limit, limit)
+        assert_close(run.tau[k], tau, 1e-7, relative=True)
+
+
+def test_gravity_that_the_motors_cannot_balance_is_refused(tmp_path: Path) -> None:
+    mechanism = load("five_bar")
+    text = mechanism.sources.texts["mechanism.toml"].replace(
+        'actuated = ["theta_1", "theta_3"]', 'actuated = ["theta_1"]'
+    )
+    (tmp_path / "mechanism.toml").write_text(text)
+    (tmp_path / "five_bar.urdf").write_text(mechanism.sources.texts["five_bar.urdf"])
+    controller = {"type": "joint_servo", "gravity": True, "motor": {"theta_1": {"K_P": 1.0}}}
+    with pytest.raises(
+        InputError, match=r"controller\.gravity: the motors cannot balance it: actuated: theta_1 cannot"
+    ):
+        simulate(load(tmp_path / "mechanism.toml"), t_end=0.1, controller=controller)
+
+
 def test_the_desired_motion_of_position_servos_is_a_quantity(tmp_path: Path) -> None:
     """`desired` exists where every independent coordinate has one, in the order of `independent`."""
     servo = {"K_P": 8.0, "K_D": 0.6}
