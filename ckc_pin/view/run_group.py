@@ -123,16 +123,16 @@ class RunGroup:
         outcomes = ["" if r.status == "done" else f" ({r.status} at {r.t[-1]:.4g} s)" for r in self.runs]
         return [escape_mathtext(label) + text for label, text in zip(label_runs(self.runs), outcomes, strict=True)]
 
-    @cached_property
-    def coordinates(self) -> list[str]:
+    @property
+    def coordinates(self) -> tuple[str, ...]:
         """Coordinates with curves: all of them without a controller, else the independent ones."""
-        is_controlled = self.kind not in ("motion", "prescribed")
-        return list(dict.fromkeys([*self.independent, *(() if is_controlled else self.runs[0].coordinates)]))
+        return self.runs[0].coordinates if self.kind in ("motion", "prescribed") else self.independent
 
     @cached_property
     def curve_names(self) -> list[str]:
         """Coordinates and motors with curves; a motion without control has none of motors."""
-        return list(dict.fromkeys([*self.coordinates, *(() if self.kind == "motion" else self.runs[0].actuated)]))
+        motors = () if self.kind == "motion" else self.runs[0].actuated
+        return list(dict.fromkeys([*self.independent, *self.coordinates, *motors]))
 
     @cached_property
     def colours(self) -> dict[str, str]:
