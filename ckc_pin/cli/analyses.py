@@ -22,9 +22,9 @@ from ckc_pin.cli.output import (
     print_json,
     print_summary,
     print_table,
-    print_written,
     require_file_path,
     skip_figures_without_matplotlib,
+    write_csv,
 )
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import CkcError, InputError
@@ -76,11 +76,7 @@ def inverse(
     else:
         print_summary(forces.summary())
         print(format_destination(out, "inverse.npz, for other programs"))
-    if csv is not None:
-        with interrupts.deferred():
-            forces.to_csv(csv)
-        if not as_json:
-            print_written([csv])
+    write_csv(forces, csv, as_json)
     exit_unless_done(forces.status, forces.message)
 
 
@@ -129,17 +125,27 @@ def _save_forces(forces: ckc_pin.MotionForces, out: Path, figures: bool) -> None
     type=options.PATH,
     help="Folder for linear.npz, figures, and the modes as runs to play; with --period for floquet.npz and run.npz.",
 )
+@options.csv(help="Also write A, B, C and D as a CSV file with the names of states, inputs and outputs.")
 @options.as_json
 def linearize(
-    what: str, at: str | None, period: float | None, overrides: dict[str, Any], out: Path | None, as_json: bool
+    what: str,
+    at: str | None,
+    period: float | None,
+    overrides: dict[str, Any],
+    out: Path | None,
+    csv: Path | None,
+    as_json: bool,
 ) -> None:
     """Compute A, B, C, D and modes in minimal coordinates. The model is exact, about rest or along a run."""
     if at is not None and period is not None:
         raise InputError(
             "--at and --period are both given; give --at for a model at one state, or --period for a periodic motion"
         )
+    if csv is not None and period is not None:
+        raise InputError("--csv and --period are both given; a periodic motion has no A, B, C and D")
     if out is not None:
         make_folder(out)
+    require_file_path(csv, "--csv")
     if period is not None:
         with ProgressBar(what) as progress:
             orbit = ckc_pin.floquet(what, period, overrides, progress)
@@ -153,6 +159,7 @@ def linearize(
     reasons = "rigid modes, modes that the loops do not follow, and modes beyond the twelfth are left out"
     note = "" if playable == modes else f"; {playable} of {modes} modes can be played: {reasons}"
     _print_model(model, out, as_json, note)
+    write_csv(model, csv, as_json)
 
 
 def _print_model(
@@ -237,14 +244,22 @@ def _save_model(model: ckc_pin.LinearModel, what: str, overrides: dict[str, Any]
 @options.overrides
 @options.out(help="Folder for sensitivities.npz and run.npz.")
 @options.figures
+@options.csv(help="Also write the derivatives as a CSV file, a row for each output instant.")
 @options.as_json
 def sensitivities(
-    scene: str, parameters: tuple[str, ...], overrides: dict[str, Any], out: Path | None, figures: bool, as_json: bool
+    scene: str,
+    parameters: tuple[str, ...],
+    overrides: dict[str, Any],
+    out: Path | None,
+    figures: bool,
+    csv: Path | None,
+    as_json: bool,
 ) -> None:
     """Compute parameter derivatives of a run. They are exact, also through impacts and sticking."""
     options.require_folder(out, figures)
     if out is not None:
         make_folder(out)
+    require_file_path(csv, "--csv")
     with ProgressBar(scene) as progress:
         result = ckc_pin.sensitivities(scene, parameters, overrides, progress)
     if out is not None:
@@ -254,6 +269,7 @@ def sensitivities(
     else:
         print_summary(result.summary())
         print(format_destination(out, "sensitivities.npz, for other programs"))
+    write_csv(result, csv, as_json)
     exit_unless_done(result.run.status, result.run.message)
 
 
@@ -299,6 +315,7 @@ def _save_sensitivities(result: ckc_pin.Sensitivities, out: Path, figures: bool)
 @click.option("--cells", metavar="N", type=int, default=200, help="Cells along each axis.")
 @click.option("--sections", metavar="N", type=int, help="For three freedoms: N sections at different heights.")
 @options.out(help="Folder for the figure.")
+@options.csv(help="Also write the map as a CSV file, a row for each cell that is reached.")
 @options.as_json
 def map_(
     mechanism: str,
@@ -309,6 +326,7 @@ def map_(
     cells: int,
     sections: int | None,
     out: Path | None,
+    csv: Path | None,
     as_json: bool,
 ) -> None:
     """Map reachable and singular configurations. There is one map for each branch, as in the paper's Fig. 2."""
@@ -318,6 +336,9 @@ def map_(
     if out is not None:
         make_folder(out)
         require_matplotlib()
+    require_file_path(csv, "--csv")
+    if csv is not None and sections is not None:
+        raise InputError("--csv and --sections are both given; write one section, without --sections")
     if sections is not None and (space != "cartesian" or scene is not None):
         raise InputError("--sections goes with --space cartesian, and without --scene")
     axes = None if over is None else [name.strip() for name in over.split(",")]
@@ -343,3 +364,5 @@ def map_(
     elif out is not None:
         for path in save_map(single, out) if sections is None else save_sections(stack, out):
             (error_console().print if as_json else print)(f"written: {path}")
+    if sections is None:
+        write_csv(single, csv, as_json)

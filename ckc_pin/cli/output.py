@@ -11,10 +11,10 @@ from pathlib import Path
 from shutil import get_terminal_size
 from threading import Timer
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ckc_pin.base.summary import to_json
-from ckc_pin.cli.signals import STOPPED, interrupt_code
+from ckc_pin.cli.signals import STOPPED, interrupt_code, interrupts
 from ckc_pin.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,10 +23,26 @@ if TYPE_CHECKING:
 
     from ckc_pin.base.summary import Summary
 
-__all__ = ["LONG_S", "ProgressBar", "Spinner", "create_table", "error_console", "exit_unless_done",
-           "format_destination", "has_printed_json", "is_terminal", "make_folder", "print_json", "print_summary",
-           "print_table", "print_written", "require_file_path", "reset_json",
-           "skip_figures_without_matplotlib"]  # fmt: skip
+__all__ = [
+    "LONG_S",
+    "ProgressBar",
+    "Spinner",
+    "create_table",
+    "error_console",
+    "exit_unless_done",
+    "format_destination",
+    "has_printed_json",
+    "is_terminal",
+    "make_folder",
+    "print_json",
+    "print_summary",
+    "print_table",
+    "print_written",
+    "require_file_path",
+    "reset_json",
+    "skip_figures_without_matplotlib",
+    "write_csv",
+]  # fmt: skip
 
 LONG_S = 10.0  # a command that may take longer announces it
 ESTIMATE_DELAY_S = 2.0  # the remaining time is estimated from the progress in this time
@@ -116,6 +132,20 @@ def print_written(paths: list[Path]) -> None:
     """Print the files that were written."""
     for path in paths:
         print(f"written: {path}")
+
+
+class _HasCsv(Protocol):
+    def to_csv(self, path: str | Path) -> Any: ...
+
+
+def write_csv(result: _HasCsv, path: Path | None, as_json: bool) -> None:
+    """Write a result as a CSV file while signals are deferred, if a path was given."""
+    if path is None:
+        return
+    with interrupts.deferred():
+        result.to_csv(path)
+    if not as_json:
+        print_written([path])
 
 
 def format_destination(out: Path | None, content: str) -> str:

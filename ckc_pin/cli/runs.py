@@ -28,6 +28,7 @@ from ckc_pin.cli.output import (
     print_written,
     require_file_path,
     skip_figures_without_matplotlib,
+    write_csv,
 )
 from ckc_pin.cli.signals import DONE, STOPPED, interrupt_code, interrupts
 from ckc_pin.errors import InputError
@@ -136,12 +137,7 @@ def _save_and_print(
 
 
 def _write_csv(finished: ckc_pin.Run, csv: Path | None, as_json: bool) -> None:
-    if csv is None:
-        return
-    with interrupts.deferred():
-        finished.to_csv(csv)
-    if not as_json:
-        print_written([csv])
+    write_csv(finished, csv, as_json)
     sys.stdout.flush()  # A live view may keep the command running.
 
 

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import ckc_pin
-from ckc_pin import InputError, Run, load, simulate
+from ckc_pin import InputError, Run, linearize, load, sensitivities, simulate, singularity_map
 from ckc_pin.run.columns import iterate_quantities
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
@@ -303,3 +303,31 @@ def test_commands_write_csv(command: str, column: str, tmp_path: Path) -> None:
     refused = ckc(*arguments[:-1], str(tmp_path))
     assert (refused.code, refused.out) == (2, "")
     assert refused.err == f"error: --csv {tmp_path}: expected the name of a file, got a folder\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "compute"),
+    [
+        (("linearize", "five_bar"), lambda: linearize("five_bar")),
+        (("sensitivities", "five_bar/swing", "link.link_2.mass", "--set", "t_end=0.1"),
+         lambda: sensitivities("five_bar/swing", ["link.link_2.mass"], {"t_end": 0.1})),
+        (("map", "five_bar", "--cells", "20"), lambda: singularity_map("five_bar", cells=20)),
+    ],
+)  # fmt: skip
+def test_commands_write_the_table_of_the_result(tmp_path: Path, arguments: tuple[str, ...], compute: Any) -> None:
+    answer = ckc(*arguments, "--csv", str(tmp_path / "table.csv"))
+    assert answer.code == 0
+    assert f"written: {tmp_path / 'table.csv'}" in answer.out.replace("\n", "")
+    compute().to_csv(tmp_path / "expected.csv")
+    assert (tmp_path / "table.csv").read_text() == (tmp_path / "expected.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("linearize", "five_bar", "--period", "1"), ("map", "delta", "--space", "cartesian", "--sections", "3")],
+)
+def test_csv_is_refused_beside_options_that_have_no_single_table(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    answer = ckc(*arguments, "--csv", str(tmp_path / "table.csv"))
+    assert answer.code == 2
+    assert answer.err.startswith("error: --csv and ")
+    assert not list(tmp_path.iterdir())
