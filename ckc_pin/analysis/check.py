@@ -275,7 +275,7 @@ def _check_stability(
     mechanism, spec = actuation.mechanism, scene.spec
     if start is None:
         return Stability(None, f"a run cannot start: {error_message}")
-    if spec.force:
+    if scene.has_forces:
         return Stability(None, "the linear model has no forces on links")
     if desired is not None and desired.leaves_at is not None:
         return Stability(None, f"the desired trajectory leaves the workspace at t = {desired.leaves_at:.5f} s")

@@ -292,9 +292,14 @@ class Scene(HasSummary):
     def _packed(self) -> bytes:
         return msgspec.msgpack.encode(_drop_absent(msgspec.to_builtins(self.spec)))
 
+    @property
+    def has_forces(self) -> bool:
+        """Whether the scene has forces on links."""
+        return bool(self.spec.force or self.forces)
+
     def refuse_forces(self, function: str) -> None:
         """Raise InputError if the scene has forces on links, for a function that does not support them."""
-        if self.spec.force or self.forces:
+        if self.has_forces:
             raise InputError(f"{function}: forces on links are not supported; remove [[force]]")
 
     def output_instants(self) -> Array:
