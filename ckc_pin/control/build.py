@@ -15,9 +15,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["SceneController", "make_controller", "read_torques"]
-
-SceneController = SetPoint | Tracking | RecordedTorques | JointServo
+__all__ = ["make_controller", "read_torques"]
 
 END_TOLERANCE = 1e-9  # relative to t_end: torques may end this much earlier
 
@@ -30,7 +28,7 @@ def make_controller(
     sources: Sources,
     start: Kinematics,
     load_model: Callable[[str], Mechanism],
-) -> SceneController:
+) -> SetPoint | Tracking | RecordedTorques | JointServo:
     """Build and check a controller.
 
     Parameters

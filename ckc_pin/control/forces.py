@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
@@ -28,8 +27,6 @@ __all__ = [
     "Force",
     "LinkForceSpec",
     "body_wrenches",
-    "build_force",
-    "force_values",
     "generalized_force",
     "place_forces",
     "read_forces",
@@ -166,33 +163,34 @@ class BodyForce:
 
     Attributes
     ----------
-    name : str
+    spec : LinkForceSpec
+        Its table, which of a function of the state has no values.
     frame : Frame
         Its origin is where the force acts.
-    in_world : bool
-        Whether the values are given in the world's axes instead of the frame's.
     over_time : PiecewisePolynomial or None
-        Force and moment, (6,), over time; None if they are functions of the state.
-    spec : LinkForceSpec
-        Its table.
-    parts : tuple of two functions of (t, terms)
-        Force and moment, used if `over_time` is None.
+        Force and moment, (6,), over time. None if they are functions of the state, or recorded in a run.
+    parts : tuple of two functions of (t, terms), optional
+        Force and moment as functions of the state.
     """
 
-    name: str
-    frame: Frame
-    in_world: bool
     spec: LinkForceSpec
-    over_time: PiecewisePolynomial | None
+    frame: Frame
+    over_time: PiecewisePolynomial | None = None
     parts: tuple[VectorFunction, VectorFunction] | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name in messages and inputs; by default the link."""
+        return self.spec.name or _link_of(self.spec)
+
+    @property
+    def in_world(self) -> bool:
+        """Whether the values are given in the world's axes instead of the frame's."""
+        return self.spec.axes == "world"
 
     def fixed(self, values: Array) -> BodyForce:
         """Return this force with constant values, shape (6,)."""
-        return replace(self, over_time=_constant(values), parts=None)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return its table in a scene. A function of the state is left out."""
-        return {key: value for key, value in msgspec.to_builtins(self.spec).items() if value not in (None, "")}
+        return BodyForce(self.spec, self.frame, _constant(values))
 
     def values(self, t: float, terms: Terms) -> Array:
         """Return force and moment in their axes, shape (6,).
@@ -209,30 +207,17 @@ class BodyForce:
         return np.concatenate([_as_vector(part(t, terms), place, "3 finite numbers") for part in self.parts])
 
 
-def build_force(force: LinkForceSpec | Force, mechanism: Mechanism, sources: Sources, where: str) -> BodyForce:
-    """Place a force on its body and read its table.
-
-    Parameters
-    ----------
-    where : str
-        The place of the force, for messages.
-
-    Raises
-    ------
-    InputError, MechanismError
-        No such link, a link that does not move, keys that exclude each other, or an unusable file.
-    """
+def _build_force(force: LinkForceSpec | Force, mechanism: Mechanism, sources: Sources, where: str) -> BodyForce:
+    """Place a force on its body and read its table; `where` is its place, for messages."""
     frame = mechanism.frames.find(force.frame, where)
-    link = _link_of(force)
     if frame.joint == 0:
+        link = _link_of(force)
         raise InputError(f"{where}: frame: {link!r} is fixed to the world and does not move; choose a link that moves")
-    name = force.name or link
-    in_world = force.axes == "world"
     if isinstance(force, LinkForceSpec):
-        return BodyForce(name, frame, in_world, force, _read_values(force, sources, where))
+        return BodyForce(force, frame, _read_values(force, sources, where))
     functions = [part if callable(part) else (lambda t, terms, part=part: part) for part in force.parts]
-    spec = LinkForceSpec(force.frame, name, force.axes)
-    return BodyForce(name, frame, in_world, spec, None, (functions[0], functions[1]))
+    spec = LinkForceSpec(force.frame, force.name, force.axes)
+    return BodyForce(spec, frame, parts=(functions[0], functions[1]))
 
 
 def _link_of(force: LinkForceSpec | Force) -> str:
@@ -263,19 +248,15 @@ def _read_values(spec: LinkForceSpec, sources: Sources, where: str) -> Piecewise
 def read_forces(
     specs: Sequence[LinkForceSpec], forces: Sequence[Force], mechanism: Mechanism, sources: Sources
 ) -> list[BodyForce]:
-    """Return the forces of a scene and of the caller.
+    """Place the forces of a scene on the bodies of a mechanism: those of its tables, then those that are functions.
 
     Raises
     ------
     InputError, MechanismError
-        As of `build_force`, or `forces` is not a sequence of `Force`.
+        No such link, a link that does not move, keys that exclude each other, an unusable file, or two equal names.
     """
-    if not isinstance(forces, Sequence):
-        raise InputError(f"forces: expected a list of ckc_pin.Force, got {describe_value(forces)}")
-    for k, force in enumerate(forces):
-        require_type(force, Force, f"forces[{k}]", "a ckc_pin.Force")
-    built = [build_force(spec, mechanism, sources, f"force[{k}]") for k, spec in enumerate(specs)]
-    built += [build_force(one, mechanism, sources, f"forces[{k}]") for k, one in enumerate(forces)]
+    built = [_build_force(spec, mechanism, sources, f"force[{k}]") for k, spec in enumerate(specs)]
+    built += [_build_force(one, mechanism, sources, f"forces[{k}]") for k, one in enumerate(forces)]
     names = [force.name for force in built]
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:
@@ -284,33 +265,12 @@ def read_forces(
 
 
 def place_forces(specs: Sequence[LinkForceSpec], mechanism: Mechanism) -> list[BodyForce]:
-    """Return the forces of a run, whose values are recorded."""
-    return [
-        BodyForce(
-            spec.name or _link_of(spec),
-            mechanism.frames.find(spec.frame, f"force[{k}]"),
-            spec.axes == "world",
-            spec,
-            None,
-        )
-        for k, spec in enumerate(specs)
-    ]
+    """Place the forces of a run on the bodies of its mechanism. Their values are in the run, not in the result."""
+    return [BodyForce(spec, mechanism.frames.find(spec.frame, f"force[{k}]")) for k, spec in enumerate(specs)]
 
 
-def force_values(forces: Sequence[BodyForce], t: float, terms: Terms) -> Array:
-    """Return force and moment of each force in its axes, shape (k, 6)."""
-    return np.array([force.values(t, terms) for force in forces]).reshape(-1, 6)
-
-
-def body_wrenches(forces: Sequence[BodyForce], values: Array, terms: Terms) -> Array:
+def body_wrenches(forces: Sequence[BodyForce], t: float, terms: Terms) -> Array:
     """Return the wrenches of forces on the bodies of the joints, in world axes, about the world's origin.
-
-    Parameters
-    ----------
-    forces : sequence of BodyForce
-    values : (k, 6) array
-        Force and moment of each in its axes.
-    terms : Terms
 
     Returns
     -------
@@ -319,8 +279,8 @@ def body_wrenches(forces: Sequence[BodyForce], values: Array, terms: Terms) -> A
     """
     pose = terms.at.pose
     wrenches = np.zeros((len(pose.translation), 6))
-    for force, value in zip(forces, values, strict=True):
-        joint, frame = force.frame.joint, force.frame
+    for force in forces:
+        joint, frame, value = force.frame.joint, force.frame, force.values(t, terms)
         rotation = np.eye(3) if force.in_world else pose.rotation[joint] @ frame.rotation
         linear, moment = rotation @ value[:3], rotation @ value[3:]
         origin = pose.rotation[joint] @ frame.translation + pose.translation[joint]
@@ -328,9 +288,9 @@ def body_wrenches(forces: Sequence[BodyForce], values: Array, terms: Terms) -> A
     return wrenches
 
 
-def generalized_force(forces: Sequence[BodyForce], values: Array, terms: Terms) -> Array:
-    """Return the generalized force of forces on the tree, shape (n,), N m or N; arguments as of `body_wrenches`."""
-    wrenches, pose = body_wrenches(forces, values, terms), terms.at.pose
+def generalized_force(wrenches: Array, terms: Terms) -> Array:
+    """Return the generalized force of wrenches on the bodies (see `body_wrenches`) on the tree, (n,), N m or N."""
+    pose = terms.at.pose
     jacobian = np.vstack([pose.linear_part, pose.angular_part])
     moves = terms.mechanism.tree.support[:, 0]  # (joints, n)
     return np.asarray(np.einsum("jc,cn,jn->n", wrenches, jacobian, moves))
@@ -338,7 +298,6 @@ def generalized_force(forces: Sequence[BodyForce], values: Array, terms: Terms) 
 
 def unit_forces(forces: Sequence[BodyForce], terms: Terms) -> Array:
     """Return the generalized forces of unit values of each component of forces, shape (n, 6 k)."""
-    count = 6 * len(forces)
-    units = np.eye(count).reshape(count, len(forces), 6)
-    columns = [generalized_force(forces, values, terms) for values in units]
-    return np.array(columns).reshape(count, terms.mechanism.n).T
+    units = [force.fixed(value) for force in forces for value in np.eye(6)]
+    columns = [generalized_force(body_wrenches([unit], 0.0, terms), terms) for unit in units]
+    return np.array(columns).reshape(len(units), terms.mechanism.n).T

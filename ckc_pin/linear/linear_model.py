@@ -18,7 +18,7 @@ from ckc_pin.base.summary import HasSummary, Row, Summary, format_eigenvalues, t
 from ckc_pin.base.tables import require_distinct, to_csv_text, to_data_frame
 from ckc_pin.base.validation import require_path
 from ckc_pin.codegen.library import Library
-from ckc_pin.control.forces import COMPONENTS, BodyForce, force_values, generalized_force, unit_forces
+from ckc_pin.control.forces import COMPONENTS, BodyForce, body_wrenches, generalized_force, unit_forces
 from ckc_pin.dynamics.formulations import require_mass
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
@@ -338,7 +338,7 @@ def linear_model(
     u_tree = mechanism.motors.force(tau) + u_tree
     plant = Plant(mechanism, smoothing, library).at(terms, u_tree, locked, forces, correction)
     push = unit_forces(forces, terms)
-    u_tree = u_tree + generalized_force(forces, force_values(forces, 0.0, terms), terms)
+    u_tree = u_tree + generalized_force(body_wrenches(forces, 0.0, terms), terms)
     if not len(plant.at):
         raise InputError(f"{mechanism.name}: no freedom remains to linearize: {_explain_locked(mechanism, locked)}")
     if not np.all(np.isfinite(plant.A)):

@@ -302,8 +302,7 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
     joints = RecordedJoints(run)
     locked, smoothing = joints.locked[k], subject.smoothing
     friction = np.zeros(mechanism.n) if smoothing is not None else -mechanism.joints.friction * joints.sliding_signs[k]
-    values = np.zeros((0, 6)) if run.force_values is None else run.force_values[k].reshape(-1, 6)
-    forces = [force.fixed(value) for force, value in zip(run.placed_forces, values, strict=True)]
+    forces = run.forces_at(k)
     model = linear_model(
         state,
         run.tau[k],

@@ -93,7 +93,7 @@ def control_table(
         spacing = float(np.diff(controller.times).min(initial=np.inf))
         if not controller.interpolates:
             table["clock"] = _clock(min(spacing, 1.0), times=controller.times)
-    callback = {
+    table["law"] = law_table(controller) or {
         "kind": "call",
         "function": call(controller, "tau" if torques else "u"),
         "state_rate": call(controller, "state_dot") if has_state(controller) else None,
@@ -101,7 +101,7 @@ def control_table(
         "outputs_torques": torques,
         "differentiates": differentiates,
     }
-    return table | {"law": law_table(controller) or callback}
+    return table
 
 
 def breakpoints_table(functions: Iterable[Any]) -> dict[str, Any] | None:

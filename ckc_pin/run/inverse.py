@@ -7,7 +7,7 @@ joints slid, stuck and touched stops.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from os.path import isfile
@@ -24,7 +24,7 @@ from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import RecordedTorques, SetPoint, Tracking
 from ckc_pin.control.desired import Desired, find_rate_jump
-from ckc_pin.control.forces import BodyForce, body_wrenches, force_values, generalized_force
+from ckc_pin.control.forces import body_wrenches, generalized_force
 from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.workspace import find_workspace_exit
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
@@ -71,26 +71,18 @@ class _Instant:
         Acceleration of the tree.
     tau : (motors,) array
         Recorded torques or preload; inverse dynamics adds the minimum-norm torques that are missing.
-    joint_force : (n,) array
-        Generalized force of friction and stops.
-    forces : sequence of BodyForce
-        Forces on links.
-    force_values : (k, 6) array
-        Force and moment of each in its axes.
+    other_force : (n,) array
+        Generalized force of friction, stops and forces on links.
+    link_wrenches : (joints, 6) array
+        Wrenches of forces on links, see `body_wrenches`.
     """
 
     t: float
     terms: Terms
     acceleration: Array
     tau: Array
-    joint_force: Array
-    forces: Sequence[BodyForce]
-    force_values: Array
-
-    @property
-    def other_force(self) -> Array:
-        """Generalized force of everything but the motors, (n,), N m or N."""
-        return self.joint_force + generalized_force(self.forces, self.force_values, self.terms)
+    other_force: Array
+    link_wrenches: Array
 
 
 def inverse_dynamics(
@@ -202,8 +194,7 @@ def _collect_motion(
 def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
     """Solve eq. 1 at one instant for tau and the multipliers, and compute the joint wrenches that follow."""
     terms, acceleration, t = instant.terms, instant.acceleration, instant.t
-    other_force = instant.other_force
-    required = tree_force(terms, acceleration) - other_force
+    required = tree_force(terms, acceleration) - instant.other_force
     if not np.all(np.isfinite(required)):
         raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
@@ -213,8 +204,7 @@ def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuatio
     if np.any(np.abs(missing) > tolerance + CROSS_TOLERANCE * tolerance.max(initial=0.0)):
         _require_actuated(mechanism, tangent, t)
     tau = instant.tau + actuation.minimum_norm_torques(tangent, missing)
-    forces = multipliers(terms, mechanism.motors.force(tau) + other_force, acceleration)
-    applied = body_wrenches(instant.forces, instant.force_values, terms)
+    forces = multipliers(terms, mechanism.motors.force(tau) + instant.other_force, acceleration)
     return {
         "t": t,
         "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
@@ -223,7 +213,7 @@ def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuatio
         "tau": tau,
         "multipliers": forces,
         "loop_wrenches": loop_wrenches(terms, forces),
-        "joint_forces": joint_wrenches(terms, acceleration, forces, applied),
+        "joint_forces": joint_wrenches(terms, acceleration, forces, instant.link_wrenches),
     }
 
 
@@ -275,10 +265,10 @@ def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) ->
             actuation.require_driven_freedoms(solution.at)
         at, previous_t = solution.at, t
         terms = Terms(mechanism, at, at.rho @ q_d_dot)
-        friction = friction_force(mechanism, terms.v_tree)
         acceleration = at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot)
-        values = force_values(forces, t, terms)
-        yield _Instant(t, terms, acceleration, actuation.preload, friction, forces, values)
+        wrenches = body_wrenches(forces, t, terms)
+        other_force = friction_force(mechanism, terms.v_tree) + generalized_force(wrenches, terms)
+        yield _Instant(t, terms, acceleration, actuation.preload, other_force, wrenches)
 
 
 def _rest_at(q_d: Array) -> Desired:
@@ -304,26 +294,26 @@ class _Record:
 
     def __init__(self, run: Run, mechanism: Mechanism) -> None:
         self.run, self.mechanism = run, mechanism
-        self.joints, self.forces = RecordedJoints(run), run.placed_forces
+        self.joints = RecordedJoints(run)
         self.prescribed = prescribed_motion(run.prescribed) if mechanism.prescribed else None
 
     def instant(self, k: int) -> _Instant:
         """Return the instant of a row (NumericalError if J has lost rank there)."""
-        run, mechanism = self.run, self.mechanism
+        run, mechanism, t = self.run, self.mechanism, float(self.run.t[k])
         at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
         terms = Terms(mechanism, at, run.v_tree[k])
-        values = np.zeros((0, 6)) if run.force_values is None else run.force_values[k].reshape(-1, 6)
-        u_tree = mechanism.motors.force(run.tau[k]) + generalized_force(self.forces, values, terms)
+        wrenches = body_wrenches(run.forces_at(k), t, terms)
+        u_tree, other_force = mechanism.motors.force(run.tau[k]), generalized_force(wrenches, terms)
         correction = np.zeros(mechanism.closure.rows)
-        friction = np.zeros(mechanism.n)
         if self.prescribed is not None:  # their motors overcome their friction
-            _, rates, accelerations = self.prescribed(float(run.t[k]))
+            _, rates, accelerations = self.prescribed(t)
             correction[mechanism.prescribed_rows] = -accelerations
             if self.joints.smoothing is None:
-                friction[mechanism.prescribed_at] = -mechanism.joints.friction[mechanism.prescribed_at] * np.sign(rates)
-        friction += self.joints.force(k, terms, u_tree + friction, correction)
-        acceleration = dae_acceleration(terms, u_tree + friction, correction)
-        return _Instant(float(run.t[k]), terms, acceleration, run.tau[k], friction, self.forces, values)
+                at_joints = mechanism.prescribed_at
+                other_force[at_joints] -= mechanism.joints.friction[at_joints] * np.sign(rates)
+        other_force += self.joints.force(k, terms, u_tree + other_force, correction)
+        acceleration = dae_acceleration(terms, u_tree + other_force, correction)
+        return _Instant(t, terms, acceleration, run.tau[k], other_force, wrenches)
 
 
 # --- joints of recorded runs ---------------------------------------------------------------------

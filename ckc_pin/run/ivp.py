@@ -30,12 +30,10 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import (
     Controller,
     TorqueController,
-    has_state,
     initial_state,
     is_torque_controller,
 )
-from ckc_pin.control.forces import BodyForce, force_values, generalized_force
-from ckc_pin.control.joint_servo import JointServo
+from ckc_pin.control.forces import BodyForce, body_wrenches, generalized_force
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.formulations import (
     CoriolisVelocity,
@@ -131,7 +129,7 @@ def as_ivp(scene: Scene | str | Path, overrides: Mapping[str, Any] | None = None
             "without stops set friction_smoothing"
         )
     start = find_start(mechanism, scene)
-    if has_state(law) and len(initial_state(law)):
+    if len(initial_state(law)):
         raise InputError(
             "as_ivp: a controller with a state of its own is no function of t and y; set K_I = 0 in a servo"
         )
@@ -157,16 +155,13 @@ def make_force(controller: Controller | TorqueController | None, actuation: Actu
         return lambda t, terms: actuation.zero.u_tree
     torques = is_torque_controller(controller)
     law: Callable[[float, Terms], Array] = getattr(controller, "tau" if torques else "u")
-    if isinstance(controller, JointServo):
-        servo, no_integral = controller, np.zeros(0)
-        return lambda t, terms: actuation.apply_tau(terms, servo.tau(t, terms, no_integral)).u_tree
     if torques:
         return lambda t, terms: actuation.apply_tau(terms, law(t, terms)).u_tree
     return lambda t, terms: apply_u(actuation, terms, law(t, terms)).u_tree
 
 
 def _with_body_forces(force: Force, forces: Sequence[BodyForce]) -> Force:
-    return lambda t, terms: force(t, terms) + generalized_force(forces, force_values(forces, t, terms), terms)
+    return lambda t, terms: force(t, terms) + generalized_force(body_wrenches(forces, t, terms), terms)
 
 
 def _with_friction(force: Force, mechanism: Mechanism, smoothing: float) -> Force:

@@ -183,9 +183,13 @@ class Run(HasSummary):
         """The scene's prescribed joints."""
         return msgspec.convert(self.scene.get("prescribed", []), list[PrescribedSpec])
 
+    def forces_at(self, k: int) -> list[BodyForce]:
+        """Return the forces on links with their values at output instant k."""
+        values = () if self.force_values is None else self.force_values[k].reshape(-1, 6)
+        return [force.fixed(value) for force, value in zip(self._placed_forces, values, strict=True)]
+
     @cached_property
-    def placed_forces(self) -> list[BodyForce]:
-        """The forces on links, whose values are `force_values`."""
+    def _placed_forces(self) -> list[BodyForce]:
         return place_forces(msgspec.convert(self.scene.get("force", []), list[LinkForceSpec]), self.mechanism)
 
     def summary(self) -> Summary:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
+from ckc_pin.base.toml_writer import to_table
 from ckc_pin.base.validation import MIN_SIMILARITY, find_nearest_name, require_callable, require_flag, require_table
 from ckc_pin.control.controllers import ControlLaw, Controller, TorqueController
 from ckc_pin.control.forces import Force
@@ -199,14 +200,17 @@ def build_run(
 
 
 def _describe_scene(prepared: Prepared) -> dict[str, Any]:
-    """Return the scene's data without a controller object, with the frames of forces that are functions."""
+    """Return the keys of a run's scene.
+
+    A controller that is a Python object has none. Forces that are functions of the state have their frames only.
+    """
     scene = prepared.scene
     data = scene.to_dict()
     if scene.controller is not None:
         data.pop("controller", None)  # The caller's controller replaced it.
     functions = prepared.forces[len(scene.spec.force) :]
     if functions:
-        data["force"] = [*data.get("force", []), *(force.to_dict() for force in functions)]
+        data["force"] = [*data.get("force", []), *(to_table(force.spec) for force in functions)]
     return data
 
 

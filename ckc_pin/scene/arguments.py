@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.tables import to_csv_text
 from ckc_pin.base.toml import read_text
 from ckc_pin.base.toml_writer import to_toml_value
 from ckc_pin.base.validation import describe_value, is_number
@@ -142,15 +143,5 @@ def _to_csv(columns: Any, where: str) -> str:
         wrong = next((x for x in column if not is_number(x)), None)
         if wrong is not None:
             raise InputError(f"{where}: column {name!r}: expected numbers, got {describe_value(wrong)}")
-    rows = zip(*values.values(), strict=True)
-    return "\n".join([_to_line(values), *(",".join(map(repr, row)) for row in rows)]) + "\n"
-
-
-def _to_line(names: Sequence[str] | Mapping[str, Any]) -> str:
-    """Return names as a line of a CSV file; those with commas and quotes are quoted."""
-    import csv
-    from io import StringIO
-
-    line = StringIO()
-    csv.writer(line, lineterminator="").writerow(names)
-    return line.getvalue()
+    t = values.pop("t")
+    return to_csv_text("t", t, {name: np.array(column) for name, column in values.items()})

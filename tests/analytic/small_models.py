@@ -1,4 +1,4 @@
-"""Small test mechanisms as files: a four-bar with springs between its links, and a plate on springs."""
+"""Small test mechanisms as files: a four-bar with springs between its links, a plate on springs, and a wheel."""
 
 from __future__ import annotations
 
@@ -89,3 +89,16 @@ def _write_and_load(folder: Path, body: str, text: str) -> Mechanism:
     (folder / "it.urdf").write_text(f'<robot name="it">{body}</robot>')
     (folder / "mechanism.toml").write_text(text)
     return load(str(folder / "mechanism.toml"))
+
+
+WHEEL_INERTIA = 0.3  # about its axle, kg m²
+
+
+def wheel_urdf(damping: float = 0.0, friction: float = 0.0) -> str:
+    """Return the URDF of a wheel on a joint called axle."""
+    return (
+        '<robot name="wheel"><link name="base"/><link name="disc"><inertial><mass value="1.0"/>'
+        f'<inertia ixx="0.2" iyy="0.2" izz="{WHEEL_INERTIA}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        '<joint name="axle" type="continuous"><parent link="base"/><child link="disc"/><axis xyz="0 0 1"/>'
+        f'<dynamics damping="{damping}" friction="{friction}"/></joint></robot>'
+    )

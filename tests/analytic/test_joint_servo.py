@@ -15,6 +15,7 @@ from scipy.linalg import expm
 import ckc_pin
 from ckc_pin import CkcError, InputError, JointServo, Sampled, Simulator, load, simulate
 from tests.analytic.five_bar import FIVE_BAR, Array
+from tests.analytic.small_models import WHEEL_INERTIA, wheel_urdf
 from tests.conftest import assert_close
 
 FORMULATIONS = ["dae", "reduced", "spf"]
@@ -68,16 +69,11 @@ def appendix_motion(*, limited: bool) -> tuple[Array, Array]:
 
 # --- closed form ---------------------------------------------------------------------------------
 
-INERTIA = 0.3
+INERTIA = WHEEL_INERTIA
 
 
 def write_wheel(folder: Path) -> Path:
-    (folder / "wheel.urdf").write_text(
-        '<robot name="wheel"><link name="base"/><link name="disc"><inertial><mass value="1.0"/>'
-        f'<inertia ixx="0.2" iyy="0.2" izz="{INERTIA}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-        '<joint name="axle" type="continuous"><parent link="base"/><child link="disc"/><axis xyz="0 0 1"/></joint>'
-        "</robot>"
-    )
+    (folder / "wheel.urdf").write_text(wheel_urdf())
     (folder / "mechanism.toml").write_text(
         'name = "wheel"\nurdf = "wheel.urdf"\n[[motor]]\nname = "drive"\njoint = "axle"\nratio = 4.0\n'
     )

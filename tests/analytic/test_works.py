@@ -11,6 +11,7 @@ from scipy.integrate import simpson
 
 from ckc_pin import InputError, Run, Simulator, ensemble, simulate
 from ckc_pin.run.run_file import WORKS
+from tests.analytic.small_models import WHEEL_INERTIA, wheel_urdf
 from tests.conftest import assert_close
 
 FORMULATIONS = ["dae", "reduced", "spf"]
@@ -33,17 +34,11 @@ def by_name(run: Run) -> dict[str, float]:
 
 # --- closed forms --------------------------------------------------------------------------------
 
-INERTIA = 0.3
-WHEEL = (
-    '<robot name="wheel"><link name="base"/><link name="disc"><inertial><mass value="1.0"/>'
-    f'<inertia ixx="0.2" iyy="0.2" izz="{INERTIA}" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-    '<joint name="axle" type="continuous"><parent link="base"/><child link="disc"/><axis xyz="0 0 1"/>'
-    '<dynamics damping="{damping}" friction="{friction}"/></joint></robot>'
-)
+INERTIA = WHEEL_INERTIA
 
 
 def wheel_scene(folder: Path, damping: float = 0.0, friction: float = 0.0) -> Path:
-    (folder / "wheel.urdf").write_text(WHEEL.replace("{damping}", str(damping)).replace("{friction}", str(friction)))
+    (folder / "wheel.urdf").write_text(wheel_urdf(damping, friction))
     (folder / "mechanism.toml").write_text('name = "wheel"\nurdf = "wheel.urdf"\nactuated = ["axle"]\n')
     path = folder / "turn.scene.toml"
     path.write_text(
