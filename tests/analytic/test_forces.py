@@ -359,8 +359,9 @@ def test_functions_that_do_not_know_forces_refuse_them(function: str) -> None:
         getattr(ckc_pin, function)("five_bar/set_point", *arguments.get(function, ()), overrides=scene(force=[WORLD]))
 
 
-def test_check_gives_no_verdict_on_stability_with_forces() -> None:
-    check = ckc_pin.check("five_bar/set_point", {"force": [WORLD]})
+@pytest.mark.parametrize("force", [WORLD, Force("link_2", lambda t, terms: [t, 0.0, 0.0])])
+def test_check_gives_no_verdict_on_stability_with_forces(force: Any) -> None:
+    check = ckc_pin.check(ckc_pin.load_scene("five_bar/set_point").with_control(None, [], [force]))
     assert check.stability is not None
     assert check.stability.stable is None
     assert "no forces on links" in check.stability.reason
