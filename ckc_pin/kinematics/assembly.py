@@ -28,7 +28,7 @@ def assemble_mechanism(
     spec: MechanismSpec,
     sources: Sources,
     overrides: Overrides | None = None,
-    prescribed: Mapping[str, float] | None = None,
+    prescribed: Mapping[str, float | None] | None = None,
 ) -> Mechanism:
     """Assemble a mechanism from its files, with overrides of its parameters and positions of prescribed joints by name.
 
@@ -46,8 +46,15 @@ def assemble_mechanism(
         if linkage.spec.independent is None:
             mechanism = _restore_guess(linkage, mechanism)
         if prescribed:
-            with_rows = Linkage(spec, sources, overrides, prescribed)
-            mechanism = _prescribe(with_rows, linkage, mechanism, prescribed)
+            for name in prescribed:
+                tree.joint_index(name, "prescribed")
+            assembled = tree.to_coordinates(mechanism.q_tree)
+            positions = {
+                name: float(assembled[tree.index[name]]) if value is None else value
+                for name, value in prescribed.items()
+            }
+            with_rows = Linkage(spec, sources, overrides, positions)
+            mechanism = _prescribe(with_rows, linkage, mechanism, positions)
         elif locking := describe_locking_loops(mechanism):
             mechanism.warnings.append(f"the loops leave no freedom (d = 0): {locking}")
         mechanism.warnings += find_model_warnings(mechanism)

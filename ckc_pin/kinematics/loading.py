@@ -67,7 +67,7 @@ cache = MechanismCache(capacity=32)
 def load(
     name: str | Path | GeneratorSpec,
     overrides: Overrides | None = None,
-    prescribed: Mapping[str, float] | None = None,
+    prescribed: Mapping[str, float | None] | None = None,
 ) -> Mechanism:
     """Load a mechanism by shipped name or path.
 
@@ -137,7 +137,10 @@ def as_mechanism(mechanism: Any, function: str) -> Mechanism:
 
 
 def build(
-    text: str, sources: Sources, overrides: Overrides | None = None, prescribed: Mapping[str, float] | None = None
+    text: str,
+    sources: Sources,
+    overrides: Overrides | None = None,
+    prescribed: Mapping[str, float | None] | None = None,
 ) -> Mechanism:
     """Return the assembled mechanism of a mechanism file. The text of the file is added to its sources.
 
@@ -155,7 +158,7 @@ def build(
 
 
 def _build(
-    text: str, sources: Sources, overrides: Overrides | None, prescribed: Mapping[str, float] | None
+    text: str, sources: Sources, overrides: Overrides | None, prescribed: Mapping[str, float | None] | None
 ) -> Mechanism:
     data = read_toml(text, sources.name)
     join_dotted_keys(data, "q_guess")

@@ -45,7 +45,6 @@ from ckc_pin.scene.parts import (
     build_scene_controller,
     build_scene_forces,
     load_scene_mechanism,
-    prescribed_motion,
 )
 from ckc_pin.scene.scene import Scene, load_scene
 
@@ -140,6 +139,12 @@ def linearize(
         require_table(overrides, "linearize: overrides", EXPECTED_OVERRIDES)
     with one_blas_thread():
         subject = _find_subject(what, at, overrides)
+        scene = subject.scene
+        if scene is not None and (in_part := [one.joint for one in scene.spec.prescribed if one.can_be_free]):
+            raise InputError(
+                f"{scene.name}: the prescribed motion of {', '.join(in_part)} begins or ends in the run, which linear "
+                "models do not support"
+            )
         if subject.mechanism.d == 0:
             raise InputError(f"{subject.mechanism.name}: d = 0, the mechanism has no freedom to linearize")
         if is_array(at):
@@ -296,7 +301,7 @@ def _linearize_at_time(subject: _Subject, t: float) -> LinearModel:
     at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
     state, correction = Terms(mechanism, at, run.v_tree[k]), np.zeros(mechanism.closure.rows)
     if mechanism.prescribed:  # the rows of prescribed joints are neither zero nor constant
-        correction[mechanism.prescribed_rows] = -prescribed_motion(run.prescribed)(t)[2]
+        correction[mechanism.prescribed_rows] = -run.prescribed_at(k)[0]
     else:
         state = _project_onto_manifold(state)
     joints = RecordedJoints(run)

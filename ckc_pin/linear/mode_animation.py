@@ -130,6 +130,7 @@ def _create_run(model: LinearModel, number: int, mode: Mode, instants: Array, st
         dissipated=None,
         works=None,
         force_values=None,
+        prescribed_states=None,
         max_phi=float(max(np.abs(x.phi).max(initial=0.0) for x in states)),
         max_phi_dot=float(max(np.abs(x.at.J @ x.v_tree).max(initial=0.0) for x in states)),
         events=[],

@@ -45,7 +45,7 @@ __all__ = [
     "control_table",
     "force_tables",
     "law_table",
-    "prescribed_table",
+    "prescribed_tables",
 ]
 
 QUARTER = math.pi / 2
@@ -104,20 +104,32 @@ def control_table(
     return table
 
 
-def breakpoints_table(functions: Iterable[Any]) -> dict[str, Any] | None:
+def breakpoints_table(
+    functions: Iterable[Any], switches: Sequence[float] = (), later: Iterable[Any] = ()
+) -> dict[str, Any] | None:
     """Return the table of the instants at which functions of time, or low derivatives, jump; None if there are none.
 
     Parameters
     ----------
     functions : iterable of callables
         Their attribute `corners`, if they have one, lists these times, s.
+    switches : sequence of float
+        Instants at which prescribed motions begin and end, s.
+    later : iterable of callables
+        Motions that begin in the run, whose times are counted from there. The loop adds them.
     """
-    times = np.unique(np.concatenate([np.zeros(0), *(getattr(f, "corners", np.zeros(0)) for f in functions)]))
-    times = _distinct(times)
-    if not len(times):
+    times, *others = (
+        _distinct(np.unique(np.concatenate([np.zeros(0), *lists])))
+        for lists in [[np.array(switches, float), *map(_corners, functions)], *([_corners(f)] for f in later)]
+    )
+    if not len(times) and not others:
         return None
-    spacing = float(np.diff(times, prepend=0.0).min())
-    return {"times": times, "tolerance": RELATIVE_TOLERANCE * min(spacing, 1.0)}
+    spacing = min(float(np.diff(t, prepend=0.0).min(initial=1.0)) for t in (times, *others))
+    return {"times": times, "tolerance": RELATIVE_TOLERANCE * spacing}
+
+
+def _corners(function: Any) -> Array:
+    return np.asarray(getattr(function, "corners", np.zeros(0)), dtype=float)
 
 
 def force_tables(
@@ -184,18 +196,41 @@ def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
     return Effort(tau, actuation.motors.force(tau), transmission @ tau)
 
 
-def prescribed_table(mechanism: Mechanism, motion: Desired, *, smooth_friction: bool) -> dict[str, Any]:
-    """Return the table of the prescribed joints of a mechanism: their rows, motors, dry friction and motion."""
-    at = mechanism.prescribed_at
-    motors = [motor for k in at if (motor := mechanism.motors.motor_on(k)) is not None]
-    return {
-        "rows": mechanism.prescribed_rows,
-        "motors": motors,
-        "offset": motion(0.0)[0],
-        "gear": mechanism.motors.transmission[np.array(motors, np.intp), at],
-        "friction": np.zeros(len(at)) if smooth_friction else mechanism.joints.friction[at],
-        "motion": _desired(motion),
-    }
+def prescribed_tables(
+    mechanism: Mechanism, motions: Sequence[Desired], switches: Sequence[dict[str, Any]], *, smooth_friction: bool
+) -> list[dict[str, Any]]:
+    """Return the tables of the prescribed joints of a mechanism.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    motions : sequence of Desired
+        Motion of each joint over the time since it began.
+    switches : sequence of dict
+        Where each motion begins and ends (`ckc_pin.run.events.switch_tables`).
+    smooth_friction : bool
+        Whether friction is a force of the mechanism, which no motor has to overcome in addition.
+    """
+    assembled, tables = mechanism.tree.to_coordinates(mechanism.q_tree), []
+    for k, row, motion, switch in zip(
+        mechanism.prescribed_at, mechanism.prescribed_rows, motions, switches, strict=True
+    ):
+        motor, is_free = mechanism.motors.motor_on(k), switch["begins_with"] or np.isfinite(switch["begins_at"])
+        assert motor is not None
+        tables.append(
+            {
+                "coordinate": int(k),
+                "row": row,
+                "motor": motor,
+                "offset": float(assembled[k] if is_free else motion(0.0)[0][0]),
+                "gear": float(mechanism.motors.transmission[motor, k]),
+                "friction": 0.0 if smooth_friction else float(mechanism.joints.friction[k]),
+                "motion": _desired(motion),
+                "corners": _corners(motion),
+                **switch,
+            }
+        )
+    return tables
 
 
 def _clock(period: float, delay: float = 0.0, times: Array | None = None) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
 
 def _joints(mechanism: Mechanism, smoothing: float | None) -> dict[str, Any]:
     joints, n = mechanism.joints, mechanism.n
-    if mechanism.prescribed and not smoothing:  # `prescribed_table` has their friction
+    if mechanism.prescribed and not smoothing:  # `prescribed_tables` have their friction
         prescribed = np.zeros(n, dtype=bool)
         prescribed[mechanism.prescribed_at] = True
         joints = joints.without(prescribed)

@@ -26,7 +26,7 @@ from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.unit_hints import describe_degrees, looks_like_degrees
 from ckc_pin.mechanism.warnings import describe_stop_violation, list_limit_violations
 from ckc_pin.scene.initial import Start, find_start, require_chart
-from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism, prescribed_motion
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism, prescribed_motions
 from ckc_pin.scene.scene import Scene
 
 __all__ = ["check_desired", "desired_warnings", "limit_warnings", "require_runnable", "run_warnings", "start_warnings"]
@@ -114,9 +114,19 @@ def _require_prescribable(
             f"prescribed: {names}: {mechanism.coordinates[k]} moves with it alone, so its dry friction and stops "
             "cannot hold it; give friction_smoothing, or remove its friction and stops"
         )
-    motion, times = prescribed_motion(spec.prescribed), np.linspace(0.0, spec.t_end, PRESCRIBED_SAMPLES)
-    positions = np.array([motion(t)[0] for t in times])
-    for k, name, values in zip(mechanism.prescribed_at, mechanism.prescribed, positions.T, strict=True):
+    times = np.linspace(0.0, spec.t_end, PRESCRIBED_SAMPLES)
+    for k, one, motion in zip(
+        mechanism.prescribed_at, spec.prescribed, prescribed_motions(spec.prescribed), strict=True
+    ):
+        name = one.joint
+        if one.can_be_free:
+            if joints.stopped[k] or (joints.friction[k] and spec.friction_smoothing is None):
+                raise InputError(
+                    f"prescribed: {name} moves freely before it begins or after it ends, where its dry friction and "
+                    "stops are not supported; give friction_smoothing, or remove its friction and stops"
+                )
+            continue
+        values = np.array([motion(t)[0][0] for t in times])
         beyond = np.flatnonzero((values < joints.lower[k]) | (values > joints.upper[k]))
         if len(beyond):
             raise InputError(

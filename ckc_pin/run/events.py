@@ -10,6 +10,7 @@ A crossing is a change of sign of (function - value):
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,9 +23,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.run.loop_terms import wrap_event_function
-from ckc_pin.scene.spec import EventSpec
+from ckc_pin.scene.spec import EventSpec, PrescribedSpec
 
-__all__ = ["Event", "EventFunction", "build_event_functions", "list_occurrences"]
+__all__ = ["Event", "EventFunction", "build_event_functions", "list_occurrences", "switch_tables"]
 
 # A coordinate or rate this close to the value counts as being on it: rad, m, rad/s, m/s.
 VALUE_TOLERANCE = 1e-12
@@ -130,6 +131,28 @@ def build_event_functions(
     return functions
 
 
+def switch_tables(prescribed: PrescribedSpec, functions: Sequence[EventFunction]) -> dict[str, Any]:
+    """Return the instants and the indices of the events where a prescribed motion begins and ends, for the native loop.
+
+    Raises
+    ------
+    InputError
+        There is no event of this name.
+    """
+    table: dict[str, Any] = {}
+    for key, switch in (("begins", prescribed.begins), ("ends", prescribed.ends)):
+        names = [function.label["name"] for function in functions]
+        if isinstance(switch, str) and switch not in names:
+            events = ", ".join(map(repr, dict.fromkeys(names))) or "none; give one by [[event]]"
+            raise InputError(
+                f"prescribed, joint {prescribed.joint!r}: {key} = {switch!r}: no event has this name; "
+                f"there are {events}"
+            )
+        table[f"{key}_at"] = switch if isinstance(switch, float) else math.inf
+        table[f"{key}_with"] = [k for k, name in enumerate(names) if name == switch]
+    return table
+
+
 def list_occurrences(
     functions: Sequence[EventFunction], mechanism: Mechanism, loop: _core.Loop
 ) -> list[dict[str, Any]]:
@@ -155,7 +178,7 @@ def _scene_event_functions(spec: EventSpec, mechanism: Mechanism, where: str) ->
     if coordinate is None and mechanism.rank == 0:
         raise InputError(f"{where}: {mechanism.name} has no closed loop, so there is no {spec.of}")
     quantity = spec.of if coordinate is None else coordinate if spec.of == "q" else f"v.{coordinate}"
-    label = {"name": f"{quantity} = {value:g}", "of": spec.of, "coordinate": coordinate, "value": value}
+    label = {"name": spec.name or f"{quantity} = {value:g}", "of": spec.of, "coordinate": coordinate, "value": value}
     k = 0 if coordinate is None else mechanism.tree.index[coordinate]
     event = _core.Event(
         quantity=_core.EventQuantity[spec.of.upper()], coordinate=k, value=value,
@@ -178,7 +201,12 @@ def _limit_functions(spec: EventSpec, mechanism: Mechanism, where: str) -> list[
         k = tree.index[name]
         for side, limit, sign in (("lower", float(lower[k]), -1.0), ("upper", float(upper[k]), 1.0)):
             if np.isfinite(limit):
-                label = {"name": f"{name} at its {side} limit", "of": "limit", "coordinate": name, "value": limit}
+                label = {
+                    "name": spec.name or f"{name} at its {side} limit",
+                    "of": "limit",
+                    "coordinate": name,
+                    "value": limit,
+                }
                 event = _core.Event(
                     quantity=_core.EventQuantity.Q, coordinate=k, value=limit, sign=sign,
                     direction=spec.direction, stop=spec.stop, zero_threshold=VALUE_TOLERANCE,

@@ -42,7 +42,6 @@ from ckc_pin.scene.parts import (
     build_scene_controller,
     build_scene_forces,
     load_scene_mechanism,
-    prescribed_motion,
 )
 from ckc_pin.scene.scene import Scene, as_scene, make_scene
 
@@ -295,7 +294,6 @@ class _Record:
     def __init__(self, run: Run, mechanism: Mechanism) -> None:
         self.run, self.mechanism = run, mechanism
         self.joints = RecordedJoints(run)
-        self.prescribed = prescribed_motion(run.prescribed) if mechanism.prescribed else None
 
     def instant(self, k: int) -> _Instant:
         """Return the instant of a row (NumericalError if J has lost rank there)."""
@@ -305,12 +303,12 @@ class _Record:
         wrenches = body_wrenches(run.forces_at(k), t, terms)
         u_tree, other_force = mechanism.motors.force(run.tau[k]), generalized_force(wrenches, terms)
         correction = np.zeros(mechanism.closure.rows)
-        if self.prescribed is not None:  # their motors overcome their friction
-            _, rates, accelerations = self.prescribed(t)
+        if mechanism.prescribed:  # their motors overcome their friction
+            accelerations, _ = run.prescribed_at(k)
             correction[mechanism.prescribed_rows] = -accelerations
             if self.joints.smoothing is None:
                 at_joints = mechanism.prescribed_at
-                other_force[at_joints] -= mechanism.joints.friction[at_joints] * np.sign(rates)
+                other_force[at_joints] -= mechanism.joints.friction[at_joints] * np.sign(run.v_tree[k, at_joints])
         other_force += self.joints.force(k, terms, u_tree + other_force, correction)
         acceleration = dae_acceleration(terms, u_tree + other_force, correction)
         return _Instant(t, terms, acceleration, run.tau[k], other_force, wrenches)

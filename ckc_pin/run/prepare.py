@@ -31,12 +31,12 @@ from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
-from ckc_pin.native.control import breakpoints_table, control_table, force_tables, prescribed_table
+from ckc_pin.native.control import breakpoints_table, control_table, force_tables, prescribed_tables
 from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
 from ckc_pin.run.checks import require_runnable, start_warnings
 from ckc_pin.run.compiled_terms import NEVER, select_library
-from ckc_pin.run.events import Event, EventFunction, build_event_functions
+from ckc_pin.run.events import Event, EventFunction, build_event_functions, switch_tables
 from ckc_pin.run.loop_terms import wrap_controller, wrap_force
 from ckc_pin.scene.initial import Start, prescribed_velocity
 from ckc_pin.scene.parts import (
@@ -45,7 +45,7 @@ from ckc_pin.scene.parts import (
     build_scene_controller,
     build_scene_forces,
     load_scene_mechanism,
-    prescribed_motion,
+    prescribed_motions,
 )
 from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
@@ -151,8 +151,18 @@ class Prepared:
         return (*self.mechanism.warnings, *start_warnings(self.scene, self.mechanism, self.start))
 
     @cached_property
-    def _prescribed_motion(self) -> Desired:
-        return prescribed_motion(self.scene.spec.prescribed)
+    def _prescribed_motions(self) -> list[Desired]:
+        return prescribed_motions(self.scene.spec.prescribed)
+
+    def _prescribed_rates(self, t: float) -> Array:
+        """Return the rates of the prescribed joints at a start at t, (joints,)."""
+        spec = self.scene.spec
+        return np.array(
+            [
+                motion(t)[1][0] if one.begins is None else spec.initial.q_dot.get(one.joint, 0.0)
+                for one, motion in zip(spec.prescribed, self._prescribed_motions, strict=True)
+            ]
+        )
 
     def begin(self, start: Start | None = None, t: float = 0.0) -> None:
         """Set the loop to a start at time t (s), by default the scene's, and discard its history.
@@ -168,7 +178,7 @@ class Prepared:
         with np.errstate(over="ignore"):
             v_tree = start.at.rho @ start.q_dot if start.v_tree is None else start.v_tree
         if self.mechanism.prescribed and start.v_tree is None:
-            v_tree = v_tree + prescribed_velocity(self.mechanism, start.at, self._prescribed_motion(t)[1])
+            v_tree = v_tree + prescribed_velocity(self.mechanism, start.at, self._prescribed_rates(t))
         if not np.all(np.isfinite(v_tree)):
             raise InputError(
                 f"initial.q_dot = {start.q_dot.tolist()}: the rates of the dependent coordinates are not finite"
@@ -233,18 +243,25 @@ def prepare(
         require_no_memory(law, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
     D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
+    switches: list[float] = []
+    later_motions: list[Desired] = []
     functions_of_time: list[Any] = [force.over_time for force in body_forces]
     if not isinstance(law, Sampled):
         functions_of_time += [law, getattr(law, "desired", None)]
     if mechanism.prescribed:
-        motion = prescribed_motion(scene.spec.prescribed)
-        functions_of_time.append(motion)
-        formulation["prescribed"] = prescribed_table(
-            mechanism, motion, smooth_friction=scene.spec.friction_smoothing is not None
+        motions = prescribed_motions(scene.spec.prescribed)
+        for one, motion in zip(scene.spec.prescribed, motions, strict=True):
+            (functions_of_time if one.begins is None else later_motions).append(motion)
+            switches += [x for x in (one.begins, one.ends) if isinstance(x, float)]
+        formulation["prescribed"] = prescribed_tables(
+            mechanism,
+            motions,
+            [switch_tables(one, functions) for one in scene.spec.prescribed],
+            smooth_friction=scene.spec.friction_smoothing is not None,
         )
     if body_forces:
         formulation["forces"] = force_tables(body_forces, partial(wrap_force, mechanism=mechanism))
-    if (breakpoints := breakpoints_table(functions_of_time)) is not None:
+    if (breakpoints := breakpoints_table(functions_of_time, switches, later_motions)) is not None:
         formulation["breakpoints"] = breakpoints
     formulation["works"] = scene.spec.work
     if isinstance(servo := unwrap_sampled(law), JointServo):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import msgspec
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
@@ -42,7 +42,7 @@ from ckc_pin.run.run_file import ARRAYS, OPTIONAL, WORKS, RunMeta, read_run, wri
 from ckc_pin.run.state import State, recorded_state
 from ckc_pin.scene.parts import prescribed_positions
 from ckc_pin.scene.scene import describe_formulation
-from ckc_pin.scene.spec import PrescribedSpec
+from ckc_pin.scene.spec import InitialSpec, PrescribedSpec
 
 if TYPE_CHECKING:
     import pandas
@@ -93,6 +93,9 @@ class Run(HasSummary):
         Works of motors, dampers, friction, forces and impacts since the start, J. None unless the scene's `work` is on.
     force_values : (m, 6 k) array or None
         Force, N, and moment, N m, of each of k forces on links, in their axes. None without any.
+    prescribed_states : (m, 2 k) array or None
+        Of each of k prescribed joints, its acceleration, rad/s^2 or m/s^2, and 1 while it moves as prescribed, else 0.
+        None without any.
     max_phi, max_phi_dot : float
         Largest |phi - w| and |phi_dot - w_dot| over the output instants.
     events : list of dict
@@ -131,6 +134,7 @@ class Run(HasSummary):
     dissipated: Array | None
     works: Array | None
     force_values: Array | None
+    prescribed_states: Array | None
     max_phi: float
     max_phi_dot: float
     events: list[dict[str, Any]]
@@ -163,7 +167,9 @@ class Run(HasSummary):
             return simulated
         overrides = plain_values(self.scene.get("parameters", {}))
         sources = Sources(self.scene_name, None, self.texts)
-        mechanism = build(self.texts[MECHANISM_FILE], sources, overrides, prescribed_positions(self.prescribed))
+        initial = msgspec.convert(self.scene.get("initial", {}), InitialSpec)
+        positions = prescribed_positions(self.prescribed, initial.q)
+        mechanism = build(self.texts[MECHANISM_FILE], sources, overrides, positions)
         for attribute in ("coordinates", "independent", "actuated"):
             names, expected = getattr(self, attribute), getattr(mechanism, attribute)
             if names != expected:
@@ -182,6 +188,19 @@ class Run(HasSummary):
     def prescribed(self) -> list[PrescribedSpec]:
         """The scene's prescribed joints."""
         return msgspec.convert(self.scene.get("prescribed", []), list[PrescribedSpec])
+
+    def prescribed_at(self, k: int) -> tuple[Array, BoolArray]:
+        """Return the accelerations of the prescribed joints at output instant k, and whether each is prescribed there.
+
+        Raises
+        ------
+        InputError
+            The run is of an older version, which did not record them.
+        """
+        if self.prescribed_states is None:
+            raise InputError(f"{self.scene_name}: this run does not have its prescribed accelerations; run it again")
+        accelerations, is_prescribed = self.prescribed_states[k].reshape(-1, 2).T
+        return accelerations, is_prescribed > 0
 
     def forces_at(self, k: int) -> list[BodyForce]:
         """Return the forces on links with their values at output instant k."""

@@ -16,7 +16,7 @@ from ckc_pin.base.atomic_files import open_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import FrameSpec, Vector3
-from ckc_pin.scene.spec import PrescribedSpec
+from ckc_pin.scene.spec import InitialSpec, PrescribedSpec
 
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "WORKS", "RunMeta", "hashes_of", "read_run", "write_run"]
 
@@ -25,7 +25,7 @@ MAX_BYTES = 2**31  # of an uncompressed run
 MAX_META_BYTES = 2**27  # of the JSON beside the arrays, which takes many times as much memory when it is parsed
 MAX_HEADER_BYTES = 10_000  # of an array's header; NumPy's own limit
 ARRAYS = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy")
-OPTIONAL = ("lyapunov", "dissipated", "works", "force_values")
+OPTIONAL = ("lyapunov", "dissipated", "works", "force_values", "prescribed_states")
 WORKS = ("motors", "dampers", "friction", "forces", "impacts")  # columns of `Run.works`
 OTHERS = ("coordinates", "meta")
 
@@ -91,6 +91,7 @@ class _Scene(msgspec.Struct):
     parameters: dict[str, float | Vector3] = {}
     force: list[_Force] = []
     prescribed: list[PrescribedSpec] = []
+    initial: InitialSpec = InitialSpec()
 
 
 class _Cost(msgspec.Struct):
@@ -197,7 +198,8 @@ def _check_shapes(path: Path, coordinates: tuple[str, ...], arrays: dict[str, Ar
     n = (len(coordinates),)
     shapes = {"t": (), "energy": (), "lyapunov": (), "dissipated": (), "phi": closure, "w": closure, "q_tree": n,
               "v_tree": n, "u": (len(meta.independent),), "tau": (len(meta.actuated),), "works": (len(WORKS),),
-              "force_values": (6 * len(meta.scene.get("force", [])),)}  # fmt: skip
+              "force_values": (6 * len(meta.scene.get("force", [])),),
+              "prescribed_states": (2 * len(meta.scene.get("prescribed", [])),)}  # fmt: skip
     for name, array in arrays.items():
         if array.shape != (rows, *shapes[name]) or array.dtype != np.float64 or not rows:
             raise InputError(

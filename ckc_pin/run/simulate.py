@@ -170,7 +170,7 @@ def build_run(
     scene, mechanism, loop = prepared.scene, prepared.mechanism, prepared.loop
     parts = _split_rows(prepared, rows)
     lyapunov, dissipated = parts.pop("lyapunov"), parts.pop("dissipated")
-    works, force_values = parts.pop("works"), parts.pop("forces")
+    works, force_values, prescribed_states = (parts.pop(name) for name in ("works", "forces", "prescribed"))
     joints, smoothing = mechanism.joints, scene.spec.friction_smoothing
     is_dissipation_known = joints.has_events(smoothing) and not joints.has_smooth_friction(smoothing)
     run = Run(
@@ -183,6 +183,7 @@ def build_run(
         dissipated=dissipated if is_dissipation_known else None,
         works=works if scene.spec.work else None,
         force_values=force_values if prepared.forces else None,
+        prescribed_states=prescribed_states if prepared.mechanism.prescribed else None,
         max_phi=float(parts.pop("max_phi").max()),
         max_phi_dot=float(parts.pop("max_phi_dot").max()),
         events=list_occurrences(prepared.events, mechanism, loop),

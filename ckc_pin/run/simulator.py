@@ -162,6 +162,12 @@ class Simulator(HasSummary):
         """
         with self._reset:
             if isinstance(state, State):
+                prescribed = self._prepared.scene.spec.prescribed
+                if in_part := [one.joint for one in prescribed if one.can_be_free]:
+                    raise InputError(
+                        f"reset: the prescribed motion of {', '.join(in_part)} begins or ends in the run, and a state "
+                        "does not tell whether it has; reset to None or to a table"
+                    )
                 self._prepared.begin(self._start_of(state), state.t)
                 self._state = state.with_mechanism(self.mechanism)
             else:

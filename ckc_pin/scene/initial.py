@@ -71,9 +71,13 @@ def _find_start(mechanism: Mechanism, spec: SceneSpec) -> Start:
             names = ", ".join(".".join(name) for name in mechanism.closure.names)
             raise InputError(f"initial.w: got {len(initial.w)} numbers; the closure has {rows} rows: {names}")
         w = np.array(initial.w, dtype=float)
-    # A prescribed joint starts as its motion does, whatever the scene says.
+    # A prescribed joint starts as its motion does, whatever the scene says, or freely (`prescribed_velocity`).
     rates = {name: rate for name, rate in initial.q_dot.items() if name not in mechanism.prescribed}
     q_dot = mechanism.vector(rates, mechanism.independent, "initial.q_dot", fill=0.0)
+    if initial.at == "equilibrium" and any(one.begins is not None for one in spec.prescribed):
+        raise InputError(
+            'initial.at = "equilibrium": it is not that of the joints which move freely at first; give initial.q'
+        )
     if initial.at is not None:
         at = mechanism.assembled if initial.at == "assembled" else stable_equilibrium(mechanism)
         if mechanism.splits_root and not np.any(w):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os.path import exists
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ __all__ = [
     "build_scene_forces",
     "load_controller_model",
     "load_scene_mechanism",
-    "prescribed_motion",
+    "prescribed_motions",
     "prescribed_positions",
     "rebuild_scene_mechanism",
 ]
@@ -52,7 +52,7 @@ def load_scene_mechanism(scene: Scene) -> Mechanism:
 
 def rebuild_scene_mechanism(scene: Scene, overrides: Overrides) -> Mechanism:
     """Load a scene's mechanism with other parameters than the scene's."""
-    positions = prescribed_positions(scene.spec.prescribed)
+    positions = prescribed_positions(scene.spec.prescribed, scene.spec.initial.q)
     if scene.mechanism_sources is not None:
         sources = scene.mechanism_sources.with_texts({})
         return build(sources.text(MECHANISM_FILE), sources, overrides, positions)
@@ -70,26 +70,37 @@ def load_controller_model(scene: Scene, name: str) -> Mechanism:
     return build(texts[name], Sources(scene.sources.name, None, files))
 
 
-def prescribed_motion(prescribed: Sequence[PrescribedSpec]) -> Desired:
-    """Return the motion of prescribed joints over time, in their order.
+def prescribed_motions(prescribed: Sequence[PrescribedSpec]) -> list[Desired]:
+    """Return the motion of each prescribed joint over the time since it began, in their order.
 
     Raises
     ------
     InputError
         Keys that do not go together, or a rate that jumps, which no finite torque can follow.
     """
-    motion = make_motion(prescribed, [f"prescribed, joint {one.joint!r}" for one in prescribed])
-    jump = find_rate_jump(motion, math.inf)
-    if jump is not None:
-        raise InputError(
-            f"prescribed: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
-            'use profile = "quintic", "cubic" or "trapezoidal"'
-        )
-    return motion
+    motions: list[Desired] = []
+    for one in prescribed:
+        where = f"prescribed, joint {one.joint!r}"
+        numbers = isinstance(one.begins, float) and isinstance(one.ends, float)
+        if numbers and not one.begins < one.ends:  # type: ignore[operator]
+            raise InputError(f"{where}: ends = {one.ends} has to be greater than begins = {one.begins}")
+        motion = make_motion([one], [where])
+        jump = find_rate_jump(motion, math.inf)
+        if jump is not None:
+            raise InputError(
+                f"{where}: the rate jumps at t = {jump:.6g} s, where no finite torque follows it; "
+                'use profile = "quintic", "cubic" or "trapezoidal"'
+            )
+        motions.append(motion)
+    return motions
 
 
-def prescribed_positions(prescribed: Sequence[PrescribedSpec]) -> dict[str, float]:
+def prescribed_positions(
+    prescribed: Sequence[PrescribedSpec], initial_q: Mapping[str, float]
+) -> dict[str, float | None]:
     """Return the positions of the prescribed joints at t = 0 by name, rad or m.
+
+    A joint that moves freely at first has its initial position, None if it has none: then that of the assembly.
 
     Raises
     ------
@@ -100,7 +111,10 @@ def prescribed_positions(prescribed: Sequence[PrescribedSpec]) -> dict[str, floa
     twice = next((name for k, name in enumerate(joints) if name in joints[:k]), None)
     if twice is not None:
         raise InputError(f"prescribed: joint {twice!r} is prescribed twice")
-    return dict(zip(joints, prescribed_motion(prescribed)(0.0)[0].tolist(), strict=True)) if joints else {}
+    return {
+        one.joint: float(motion(0.0)[0][0]) if one.begins is None else initial_q.get(one.joint)
+        for one, motion in zip(prescribed, prescribed_motions(prescribed), strict=True)
+    }
 
 
 def _resolve_path(scene: Scene, name: str) -> str | Path:

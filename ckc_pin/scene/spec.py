@@ -126,6 +126,9 @@ class EventSpec(FileStruct, frozen=True):
     stop
         Whether the event ends the run.
         ``stop = true``
+    name
+        Name in the run's events; default: such as ``theta_1 = 0.5``.
+        ``name = "contact"``
     """
 
     coordinate: str | None = None
@@ -133,6 +136,7 @@ class EventSpec(FileStruct, frozen=True):
     value: float | None = None
     direction: Literal[-1, 0, 1] = 0
     stop: bool = False
+    name: Name | None = None
 
 
 class PrescribedSpec(MotionSpec, frozen=True, kw_only=True):
@@ -143,9 +147,23 @@ class PrescribedSpec(MotionSpec, frozen=True, kw_only=True):
     joint
         The joint. It is no longer an independent coordinate.
         ``joint = "crank"``
+    begins : s
+        An instant, or the name of an event; default: the start. Before, the joint moves freely. The motion is then
+        counted from this instant and from the joint's position there.
+        ``begins = 0.5``
+    ends : s
+        An instant, or the name of an event. From there on the joint moves freely; default: never.
+        ``ends = "theta_3 = -1.5"``
     """
 
     joint: Name
+    begins: Positive | Name | None = None
+    ends: Positive | Name | None = None
+
+    @property
+    def can_be_free(self) -> bool:
+        """Whether the joint moves freely during a part of the run."""
+        return self.begins is not None or self.ends is not None
 
 
 class SceneSpec(FileStruct, frozen=True):

@@ -38,7 +38,7 @@ def test_all_errors_of_a_file_are_found() -> None:
         (("controller", "sample_time"), "value"),
     }
     assert faults[("formulation",), "value"].choices == ("dae", "reduced", "spf")
-    assert faults[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop")
+    assert faults[("event", 1), "unknown key"].choices == ("coordinate", "of", "value", "direction", "stop", "name")
     assert faults[("event", 1), "unknown key"].suggestion == "coordinate"
     assert faults[(), "missing key"].value == "mechanism"
     assert faults[("controller", "K_D", 0, 1), "value"].value == "a"

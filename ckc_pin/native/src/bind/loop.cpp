@@ -41,19 +41,26 @@ std::unique_ptr<System> system_from_table(Core& core, Control& control, const nb
   return std::make_unique<PrintedSpf>(core, control, epsilon, actual);
 }
 
-PrescribedJoints prescribed_from_table(const nb::dict& table, const Core& core, Eigen::Index motors) {
-  PrescribedJoints joints{get<Indices>(table, "rows"),
-                          get<Indices>(table, "motors"),
-                          get<Vector>(table, "offset"),
-                          get<Vector>(table, "gear"),
-                          get<Vector>(table, "friction"),
-                          {}};
-  const auto size = static_cast<int>(joints.rows.size());
-  require_indices(joints.rows, core.constraints.closure.rows, "prescribed rows");
-  require_indices(joints.motors, static_cast<int>(motors), "motors of prescribed joints");
-  for (const Vector* x : {&joints.offset, &joints.gear, &joints.friction}) require(*x, size, "prescribed");
-  joints.trajectory = trajectory_from_table(get<nb::dict>(table, "motion"), size);
-  return joints;
+PrescribedJoint prescribed_from_table(const nb::dict& table, const Core& core, Eigen::Index motors,
+                                      std::vector<Event>& events) {
+  PrescribedJoint joint{get<int>(table, "coordinate"),
+                        get<int>(table, "row"),
+                        get<int>(table, "motor"),
+                        get<double>(table, "offset"),
+                        get<double>(table, "gear"),
+                        get<double>(table, "friction"),
+                        trajectory_from_table(get<nb::dict>(table, "motion"), 1),
+                        get<Vector>(table, "corners"),
+                        {get<double>(table, "begins_at"), get<Indices>(table, "begins_with")},
+                        {get<double>(table, "ends_at"), get<Indices>(table, "ends_with")}};
+  require_indices({joint.coordinate}, core.n, "prescribed joint");
+  require_indices({joint.row}, core.constraints.closure.rows, "row of a prescribed joint");
+  require_indices({joint.motor}, static_cast<int>(motors), "motor of a prescribed joint");
+  for (const auto& change : {joint.begins, joint.ends}) {
+    require_indices(change.events, static_cast<int>(events.size()), "events of a prescribed joint");
+    for (int k : change.events) events[static_cast<size_t>(k)].switches_joints = true;
+  }
+  return joint;
 }
 
 Event event_from_table(const EventTable& table, const Core& core, const std::shared_ptr<View>& view) {
@@ -83,9 +90,14 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   loop.core = core_from_table(core);
   auto owned_control = control_from_table(control, *loop.core, loop.view);
   auto system = system_from_table(*loop.core, *owned_control, formulation);
+  std::vector<Event> list;
+  for (nb::handle item : events)
+    list.push_back(event_from_table(nb::cast<const EventTable&>(item), *loop.core, loop.view));
+  std::vector<PrescribedJoint> prescribed;
   if (formulation.contains("prescribed"))
-    system->prescribe(prescribed_from_table(get<nb::dict>(formulation, "prescribed"), *loop.core,
-                                            owned_control->tau.size()));
+    for (const auto& joint : get<std::vector<nb::dict>>(formulation, "prescribed"))
+      prescribed.push_back(prescribed_from_table(joint, *loop.core, owned_control->tau.size(), list));
+  if (!prescribed.empty()) system->prescribe(std::move(prescribed));
   if (formulation.contains("forces"))
     system->set_forces(
         forces_from_tables(get<std::vector<nb::dict>>(formulation, "forces"), *loop.core, loop.view));
@@ -108,12 +120,9 @@ void prepare(Loop& loop, const nb::dict& core, const nb::dict& formulation, cons
   require(is_known, "method: " + options.method + " is unknown");
   require(options.rtol > 0 && options.atol > 0 && options.max_step > 0,
           "rtol, atol and max_step: positive numbers are needed");
-  std::vector<Event> functions;
-  for (nb::handle event : events)
-    functions.push_back(event_from_table(nb::cast<const EventTable&>(event), *loop.core, loop.view));
   loop.core->profile.on = get<bool>(solver, "profile");
   loop.step_loop = std::make_unique<StepLoop>(std::move(owned_control), std::move(system), std::move(sensitivities),
-                                              options, std::move(functions));
+                                              options, std::move(list));
 }
 
 namespace {

@@ -110,6 +110,13 @@ class Core {
   // Prescribed motion of rows at the present time. `set_configuration` uses its value. Empty if all rows are constant.
   RowMotion row_motion;
   bool has_row_motion() const { return row_motion.value.size() > 0; }
+  // Rows without force: their accelerations are those of the motion without these rows. Only in functions that compute
+  // accelerations; all others treat them as the other rows.
+  void release_rows(Indices rows) { released_ = std::move(rows), released_configuration_ = -1; }
+  bool has_released_rows() const { return !released_.empty(); }
+  // Motion x with J x = 1 for one row, else 0, minimum-norm in the metric of D'. Released rows yield. False if J has
+  // lost rank.
+  bool unit_row_response(int row, Out x);
   const Tree& placed_tree() { return update_tree(), tree; }  // with the placements of all joints and the Jacobian
   double tolerance_scale() const { return tree.tolerance_scale(q_tree, scales.columns); }
   // Incremented by `set_configuration`. A caller that remembers it can tell whether the core has moved.
@@ -230,6 +237,8 @@ class Core {
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
+  bool compute_released_directions();
+  bool add_released_motion(In force, Out a);  // so that D' a = force along the motions of the released rows
   struct Components;                         // velocity components of the bodies
   void body_velocity_components(Components& of);
   bool find_basis_for_check();                      // by pivoting; the basis is not used later
@@ -257,6 +266,10 @@ class Core {
   Matrix tangent_matrix_, by_state_, force_derivative_, responses_;
   DefiniteFactor tangent_factor_;
   Vector rounding_, force_bound_;
+  Indices released_;
+  long released_configuration_ = -1;  // `configuration_count` of the next members
+  Matrix released_directions_, released_inertia_;
+  Vector released_force_, released_rates_;
   Vector householder_rhs_, minus_residual_, rho_times_x_, tangent_solution_, tangent_rhs_, unbalanced_force_, lambda_;
 };
 

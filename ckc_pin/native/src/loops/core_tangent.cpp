@@ -3,6 +3,7 @@
 #include <cmath>
 #include <limits>
 #include <numeric>
+#include <utility>
 
 #include "loops/core.hpp"
 #include "loops/compiled_terms.hpp"
@@ -171,7 +172,51 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
   if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
   if (!uses_mass_levels_ || !project_by_mass_levels(u_tree, acceleration))
     project_on_tangent_space(u_tree, acceleration);
+  if (released_.empty()) return true;
+  y_ = u_tree - bias_tree + damping_tree;
+  return add_released_motion(y_, acceleration);
+}
+
+bool Core::unit_row_response(int row, Out x) {
+  compute_J();
+  residual_.setZero(), residual_(row) = -1.0;
+  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
+  factorize_tangent_inertia();
+  multiply_D_tree(x_, y_);
+  y_ = -y_;
+  add_force_response(y_, x);
+  if (released_.empty()) return true;
+  y_.setZero();
+  return add_released_motion(y_, x);
+}
+
+bool Core::compute_released_directions() {
+  if (released_configuration_ == configuration_count) return true;
+  const auto count = static_cast<Eigen::Index>(released_.size());
+  const Indices rows = std::exchange(released_, {});  // of all rows here
+  released_directions_.resize(n, count), released_rates_.resize(count);
+  bool exists = true;
+  for (Eigen::Index k = 0; k < count && exists; ++k) exists = unit_row_response(rows[k], released_directions_.col(k));
+  released_ = rows;
+  if (!exists) return false;
+  released_inertia_.resize(count, count);
+  for (Eigen::Index k = 0; k < count; ++k) {
+    multiply_D_tree(released_directions_.col(k), y_);
+    released_inertia_.col(k).noalias() = released_directions_.transpose() * y_;
+  }
+  released_configuration_ = configuration_count;
   return true;
+}
+
+bool Core::add_released_motion(In force, Out a) {
+  released_force_ = force;  // may be a workspace
+  if (!compute_released_directions()) return false;
+  multiply_D_tree(a, y_);
+  released_force_ -= y_;
+  released_rates_.noalias() = released_directions_.transpose() * released_force_;
+  released_rates_ = released_inertia_.llt().solve(released_rates_);
+  for (Eigen::Index k = 0; k < released_rates_.size(); ++k) a += released_rates_(k) * released_directions_.col(k);
+  return finite(a);
 }
 
 void Core::project_on_tangent_space(In u_tree, Out a) {
@@ -266,6 +311,10 @@ bool Core::unit_force_responses(const Indices& at, Matrix& columns) {
   for (size_t k = 0; k < at.size(); ++k) {
     y_.setUnit(at[k]);
     add_force_response(y_, columns.col(k));
+  }
+  for (size_t k = 0; k < at.size() && has_released_rows(); ++k) {
+    y_.setUnit(at[k]);
+    if (!add_released_motion(y_, columns.col(k))) return false;
   }
   return true;
 }
@@ -371,7 +420,7 @@ bool Core::acceleration_derivatives(In q_at, In v, In correction, AppliedForce& 
 }
 
 bool Core::compiled_acceleration(In q_tree, In v, In u_tree, In correction, Out acceleration) const {
-  return compiled && compiled->acceleration(q_tree, v, u_tree, correction, acceleration);
+  return compiled && released_.empty() && compiled->acceleration(q_tree, v, u_tree, correction, acceleration);
 }
 
 }  // namespace ckc

@@ -32,11 +32,11 @@ void Dae::start(double, In q_tree, In v, In, Out y) {
 void Dae::set_core(In q_tree, bool with_inertia) {
   core.set_configuration(q_tree, with_inertia);
   core.compute_J();
-  core_configuration_ = with_inertia ? core.configuration_count : -1, core_time_ = row_time();
+  core_configuration_ = with_inertia ? core.configuration_count : -1, core_row_version_ = row_version();
 }
 
 bool Dae::is_core_at_state() const {
-  return core_configuration_ == core.configuration_count && core_time_ == row_time() && q_tree_ == core.q_tree;
+  return core_configuration_ == core.configuration_count && core_row_version_ == row_version() && q_tree_ == core.q_tree;
 }
 
 // Does nothing if the core is already at this configuration.
@@ -55,7 +55,8 @@ bool Dae::motion_rhs(double t, In y, Out y_dot) {
   const auto v = y.tail(core.n);
   v_tree = v;
   // Compiled terms give the acceleration without setting the core.
-  if (core.compiled && core.joints.locked.empty() && !force_needs_core() && !is_stabilized()) {
+  if (core.compiled && core.joints.locked.empty() && !force_needs_core() && !is_stabilized() &&
+      !core.has_released_rows()) {
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
     const bool has_force = has_applied_force();
@@ -247,7 +248,7 @@ void Dae::move_core_to_last_rhs(In y) {
   velocity = v_tree = velocity_in(y);
 }
 
-bool Dae::sync_core_at_last_rhs(double t, In y) {
+bool Dae::sync_motion_at_last_rhs(double t, In y) {
   if (!set_time(t)) return false;
   set_core_configuration(y);
   velocity = v_tree = velocity_in(y);
@@ -273,7 +274,7 @@ void Dae::write_projected_state(Out y) const {
   if (projects_) y.head(core.tree.nq) = core.q_tree, y.segment(core.tree.nq, core.n) = velocity;
 }
 
-Accepted Dae::accept_step(double t, Out y, double) {
+Accepted Dae::accept_motion(double t, Out y, double) {
   if (!set_time(t)) return Accepted::rejected;
   elimination.accept_step(core);
   if (!projects_) return Accepted::unchanged;

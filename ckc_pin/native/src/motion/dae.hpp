@@ -14,20 +14,20 @@ class Dae : public System {
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool sync_motion(double t, In y) override;
   bool sync_core_at_start(double t, In y) override;
-  bool sync_core_at_last_rhs(double t, In y) override;
+  bool sync_motion_at_last_rhs(double t, In y) override;
   bool sync_motion_unprojected(double t, In y) override;
   bool read_from_state(In y, int k, bool of_rate, double& value) const override;
   void write_projected_state(Out y) const override;
   bool set_core_configuration(In y) override;
-  Accepted accept_step(double t, Out y, double margin) override;
+  Accepted accept_motion(double t, Out y, double margin) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
   bool conserves_energy() const override { return projects_ && !core.has_row_motion(); }
   bool reduce_to_freedoms(In y, Matrix& jacobian) override;
   const Vector& configuration_at_last_rhs() const override { return q_tree_; }
   void move_core_to_last_rhs(In y) override;
   bool tree_acceleration(In f, Out a) const override { return a = velocity_in(f), true; }
-  void add_velocity(Out y, In v) const override { y.segment(core.tree.nq, core.n) += v; }
-  void add_displacement(Out y, In step) const override { core.tree.integrate(y.head(core.tree.nq), step); }
+  void add_motion_velocity(Out y, In v) const override { y.segment(core.tree.nq, core.n) += v; }
+  void add_motion_displacement(Out y, In step) const override { core.tree.integrate(y.head(core.tree.nq), step); }
   bool rate_on_manifold(double t, In y, Out y_dot) override;
 
  private:
@@ -50,7 +50,7 @@ class Dae : public System {
   const double tolerance_, alpha_, beta_;
   const bool projects_;
   long core_configuration_ = -1;  // core.configuration_count when this object last set the core; -1: without inertia
-  double core_time_ = 0.0;        // `row_time` then
+  long core_row_version_ = 0;     // `row_version` then
   Vector q_tree_;                 // configuration of the last right-hand side
   Vector step_, z_step_, residual_, no_force_, phi_dot_;
   Matrix stabilization_;

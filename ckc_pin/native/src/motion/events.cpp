@@ -269,7 +269,7 @@ bool Events::search_step(Interpolant& motion, bool last, double& stop_time) {
     for (const auto& [t, direction] : search.sign_changes) {
       if (event.direction != 0 && event.direction != direction) continue;
       new_occurrences_.push_back({t, k, direction});
-      if (event.stop) stop_time = std::min(stop_time, t);
+      if (event.stop || event.switches_joints) stop_time = std::min(stop_time, t);
     }
   }
   return true;
@@ -281,7 +281,7 @@ void Events::report_occurrences(double stop_time) {
   std::sort(new_occurrences_.begin(), new_occurrences_.end(), [](const EventOccurrence& a, const EventOccurrence& b) {
     return a.t != b.t ? a.t < b.t : a.event < b.event;
   });
-  joint_events.clear(), stopped_ = false;
+  joint_events.clear(), switching.clear(), stopped_ = false;
   const auto changes_modes = [&](const EventOccurrence& occurrence) {
     return occurrence.t == stop_time && events_[occurrence.event].is_joint_event;
   };
@@ -290,11 +290,13 @@ void Events::report_occurrences(double stop_time) {
   for (const EventOccurrence& occurrence : new_occurrences_) {
     const Event& event = events_[occurrence.event];
     if (occurrence.t > (event.is_joint_event ? stop_time : until)) continue;
-    if (event.is_joint_event)
+    if (event.is_joint_event) {
       joint_events.push_back(event);
-    else
-      occurrences.push_back({std::min(occurrence.t, stop_time), occurrence.event, occurrence.direction}),
-          stopped_ |= event.stop;
+      continue;
+    }
+    occurrences.push_back({std::min(occurrence.t, stop_time), occurrence.event, occurrence.direction});
+    stopped_ |= event.stop;
+    if (event.switches_joints) switching.push_back(occurrence.event);
   }
   for (int k : to_search_) {
     if (!std::isfinite(stop_time)) signs_[k] = searches_[k].sign;

@@ -22,6 +22,7 @@ struct Event {
   double value = 0.0, sign = 1.0;  // the event's function is sign * (quantity - value)
   int direction = 0;               // 1: rising, -1: falling, 0: both
   bool stop = false;               // whether it stops the loop
+  bool switches_joints = false;    // whether a prescribed joint begins or ends to move there
   double zero_threshold = 0.0;     // smaller values count as zero
   // Evaluate a user's function at (t, state of the core). False if it raised an exception.
   std::function<bool(double, System&, double&)> evaluate;
@@ -94,6 +95,7 @@ class Events {
   double failed_value = 0.0;
   bool is_empty() const { return events_.empty(); }
   bool stopped() const { return stopped_; }  // whether the last stop was due to a user's event
+  Indices switching;  // events of the last stop at which prescribed joints may begin or end
 
  private:
   struct End {  // state at an end of the step, as the right-hand side left it

@@ -52,7 +52,7 @@ void Events::report_arrival(int k, int sign, double& stop_time) {
   crossed_at_[k] = step_.t;
   if (event.direction && event.direction != direction) return;
   new_occurrences_.push_back({step_.t, k, direction});
-  if (event.stop) stop_time = std::min(stop_time, step_.t);
+  if (event.stop || event.switches_joints) stop_time = std::min(stop_time, step_.t);
 }
 
 bool Events::has_just_crossed(int k) const { return std::abs(step_.t - crossed_at_[k]) <= change_time_tolerance_; }

@@ -99,7 +99,7 @@ bool LevelSet::sync_core_at_start(double t, In y) {
 }
 
 // Near a singular phi_z the state must be projected exactly, or later states cannot be.
-bool LevelSet::sync_core_at_last_rhs(double t, In y) {
+bool LevelSet::sync_motion_at_last_rhs(double t, In y) {
   if (coordinate_margin() < min_margin && !sync_core(t, y)) return false;
   last_q_tree_ = core.q_tree;
   if (elimination.is_due()) elimination.remember_state(core.q_tree, v_tree, applied_force(v_tree));
@@ -133,7 +133,8 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
     chart_.coordinate_rates(core, core.q_tree, q_dot, y_dot.head(d));
   // On the manifold eq. 6 equals eq. 1 at rho q_dot.
   const Vector& force = applied_force(v_tree);
-  const bool locked = !core.joints.locked.empty(), compiled = on_manifold_ && core.compiled && !locked;
+  const bool locked = !core.joints.locked.empty();
+  const bool compiled = on_manifold_ && core.compiled && !locked && !core.has_released_rows();
   has_tree_acceleration_ =
       compiled && core.compiled_acceleration(core.q_tree, v_tree, force, row_correction_, a_tree_);
   if (compiled && !has_tree_acceleration_) ++counts.general_rhs;
@@ -207,11 +208,11 @@ bool LevelSet::tree_acceleration(In f, Out a) const {
   return true;
 }
 
-void LevelSet::add_velocity(Out y, In v) const {
+void LevelSet::add_motion_velocity(Out y, In v) const {
   for (int k = 0; k < core.d; ++k) y(core.d + k) += v(core.q[k]);
 }
 
-void LevelSet::add_displacement(Out y, In step) const {
+void LevelSet::add_motion_displacement(Out y, In step) const {
   if (!chart_.is_trivial()) return;
   for (int k = 0; k < core.d; ++k) y(k) += step(core.q[k]);
 }
@@ -263,7 +264,7 @@ void LevelSet::add_rounding(In x, Out scale) const {
 
 // Off the manifold the motion of eq. 8 depends on the choice of q, because only z_dot closes the loops. There the
 // partition does not change.
-Accepted LevelSet::accept_step(double t, Out y, double present_margin) {
+Accepted LevelSet::accept_motion(double t, Out y, double present_margin) {
   accepted_q_tree_ = last_q_tree_;
   elimination.accept_step(core);
   if (rejection_balance_ == 0.0) usual_step_ = t - accepted_t_;

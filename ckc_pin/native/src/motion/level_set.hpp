@@ -16,17 +16,17 @@ class LevelSet : public System {
   void start(double t, In q_tree, In v_tree, In w, Out y) override;
   bool sync_motion(double t, In y) override { return project_state(t, y, tolerance_); }
   bool sync_core_at_start(double t, In y) override;
-  bool sync_core_at_last_rhs(double t, In y) override;
+  bool sync_motion_at_last_rhs(double t, In y) override;
   bool read_from_state(In y, int k, bool of_rate, double& value) const override;
   double coordinate_margin() override { return phi_z_margin(); }
-  Accepted accept_step(double t, Out y, double margin) override;
+  Accepted accept_motion(double t, Out y, double margin) override;
   bool restore_partition(double t, Out y, bool& changed) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
   double w_decay_rate() const override { return -1.0 / epsilon_; }
   double boundary_layer_time() const override { return on_manifold_ ? System::boundary_layer_time() : epsilon_; }
   bool tree_acceleration(In f, Out a) const override;
-  void add_velocity(Out y, In v) const override;
-  void add_displacement(Out y, In step) const override;
+  void add_motion_velocity(Out y, In v) const override;
+  void add_motion_displacement(Out y, In step) const override;
   void resume(double t, Out y) override;
   bool conserves_energy() const override { return on_manifold_ && !core.has_row_motion(); }
   bool return_to_accepted() override;

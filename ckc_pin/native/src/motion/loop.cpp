@@ -53,6 +53,7 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   system->counts = {}, system->failure = RhsFailure::none;
   control->failure = {};
   control->start();
+  system->start_prescribed_joints(q_tree, v_tree);
   system->start_segment(t);
   reset_joints();
   start_state();
@@ -112,8 +113,10 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
                         ? static_cast<double>(advances_unchanged_ - 1) * (until - from)
                         : 0.0;
   for (;;) {
-    if (system->next_breakpoint() <= now.t + system->breakpoint_tolerance())
+    if (system->next_breakpoint() <= now.t + system->breakpoint_tolerance()) {
+      if (!system->switch_prescribed_joints(now.t, now.y, {})) return step_failure();
       system->start_segment(now.t), state_changed();
+    }
     const bool is_sampled = control->sampling.has_value();
     const double time_tolerance =
         std::max(is_sampled ? control->sampling->time_tolerance(now.t) : 0.0, system->breakpoint_tolerance());
@@ -140,6 +143,7 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
       }
       if (waiting_step_) return report_present(until);
       if (const auto stop = check_pace(until)) return *stop;
+      if (system->next_breakpoint() < bound) break;  // a prescribed motion has begun
       const double seconds = elapsed();
       if (seconds > budget) return {Stop::wall_budget, now.t};
       if (seconds > pause || work.rhs >= pause_at) return is_paused_ = true, Stop{Stop::pause, now.t};
@@ -317,6 +321,10 @@ std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) 
       now.y = stop_time < now.t_new ? y_out_ : now.y_new, now.t = stop_time;
       state_is_accepted_ = false;
       state_changed(), events.restart();
+      if (!events.switching.empty()) {
+        if (!system->switch_prescribed_joints(now.t, now.y, events.switching)) return step_failure();
+        system->start_segment(now.t);
+      }
       if (!events.stopped()) return {};  // only joint modes change
       // The state before an impact may have been recorded.
       if (system->core.joints.has_events() && now.t == now.t_old) recorder.drop_row_at(now.t);

@@ -39,7 +39,7 @@ bool PrintedSpf::sync_motion(double t, In y) {
   return true;
 }
 
-Accepted PrintedSpf::accept_step(double, Out, double margin) {
+Accepted PrintedSpf::accept_motion(double, Out, double margin) {
   return margin > chart_margin ? Accepted::unchanged : Accepted::rejected;
 }
 

@@ -24,6 +24,7 @@ static std::vector<RecordColumns> columns_of(const System& system) {
       {"max_phi_dot", 1},
       {"forces", system.forces() ? system.forces()->wrenches.size() : 0},
       {"works", system.integrates_works() ? work_count + 1 : 0},  // those of `WorkOf`, then of impacts
+      {"prescribed", 2 * static_cast<Eigen::Index>(system.prescribed_joints().size())},
       {"extra", system.integrand ? system.integrand->record_size() : 0},
   };
   std::vector<RecordColumns> columns;
@@ -65,7 +66,7 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   row(at++) = t;
   core.tree.to_coordinates(core.q_tree, row.segment(at, n)), at += n;
   append(system.velocity), append(system.control.u.head(d)), append(system.control.tau.head(actuators));
-  if (system.has_prescribed_joints() && !system.set_prescribed_torques(t, row.segment(at - actuators, actuators)))
+  if (!system.prescribed_joints().empty() && !system.set_prescribed_torques(t, row.segment(at - actuators, actuators)))
     return false;
   append(core.constraints.phi), append(system.w);
   row(at++) = energy.total();
@@ -81,6 +82,8 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
   if (system.forces()) append(system.forces()->wrenches);
   if (system.integrates_works()) append(system.works(y)), row(at++) = -core.joints.impact_loss;
+  for (const PrescribedJoint& joint : system.prescribed_joints())
+    row(at++) = joint.acceleration, row(at++) = joint.is_free ? 0.0 : 1.0;
   if (system.integrand) system.integrand->fill_record(y, row.tail(width - at));
   return std::isfinite(energy.total()) && row.head(1 + 2 * n).allFinite();
 }

@@ -27,8 +27,12 @@ void System::integrate_works() {
 }
 
 void System::start_appended(Out y) {
-  if (law_size_) y.segment(motion_size, law_size_) = control.law->initial_state();
-  y.segment(motion_size + law_size_, work_size_).setZero();
+  Eigen::Index at = motion_size;
+  if (law_size_) y.segment(at, law_size_) = control.law->initial_state();
+  at += law_size_;
+  for (const PrescribedJoint& joint : prescribed_)
+    if (joint.can_be_free()) y(at++) = joint.position, y(at++) = joint.rate;
+  y.segment(at, work_size_).setZero();
 }
 
 double System::next_breakpoint() const {
@@ -44,34 +48,132 @@ void System::start_segment(double t) {
                                            : -std::numeric_limits<double>::infinity(),
                end = next_breakpoint();
   if (control.is_feedback()) control.law->set_segment(begin, end, tolerance);
-  if (has_prescribed_joints()) prescribed_.trajectory->set_segment(begin, end, tolerance);
+  for (PrescribedJoint& joint : prescribed_) joint.motion->set_segment(begin - joint.from, end - joint.from, tolerance);
   if (forces_) forces_->set_segment(begin, end, tolerance);
   row_time_ = std::numeric_limits<double>::quiet_NaN();
 }
 
-void System::prescribe(PrescribedJoints joints) {
+// --- prescribed joints ---
+
+bool PrescribedJoint::Switch::is_due(double t, const Indices& occurred) const {
+  return time <= t || std::find_first_of(events.begin(), events.end(), occurred.begin(), occurred.end()) != events.end();
+}
+
+void System::prescribe(std::vector<PrescribedJoint> joints) {
   prescribed_ = std::move(joints);
   const int rows = core.constraints.closure.rows;
   for (Vector* x : {&core.row_motion.value, &core.row_motion.rate, &core.row_motion.acceleration, &lambda_})
     x->setZero(rows);
-  for (Vector* x : {&row_value_, &row_rate_, &row_acceleration_}) x->setZero(prescribed_.offset.size());
+  for (const PrescribedJoint& joint : prescribed_) free_size_ += joint.can_be_free() ? 2 : 0;
+  size = coupled_size();
+  crosses_singularities &= !free_size_;  // collocation steps integrate the motion alone
+}
+
+void System::start_prescribed_joints(In q_tree, In v_tree) {
+  breakpoints_ = fixed_breakpoints_;
+  for (PrescribedJoint& joint : prescribed_) {
+    joint.from = joint.shift = joint.acceleration = 0.0, joint.has_ended = false;
+    joint.is_free = joint.begins.exists();
+    joint.position = q_tree(core.tree.q_index[joint.coordinate]), joint.rate = v_tree(joint.coordinate);
+    set_row(joint);
+  }
+  if (free_size_) release_free_rows();
+}
+
+void System::release_free_rows() {
+  Indices rows;
+  for (const PrescribedJoint& joint : prescribed_)
+    if (joint.is_free) rows.push_back(joint.row);
+  core.release_rows(std::move(rows));
+  row_time_ = std::numeric_limits<double>::quiet_NaN();
+}
+
+void System::set_row(const PrescribedJoint& joint) {
+  core.row_motion.value(joint.row) = joint.position - joint.offset;
+  core.row_motion.rate(joint.row) = joint.rate;
+  // `acceleration` of a free joint is a result, which the core adds itself.
+  core.row_motion.acceleration(joint.row) = joint.is_free ? 0.0 : joint.acceleration;
+  row_correction_(joint.row) = -core.row_motion.acceleration(joint.row);
 }
 
 bool System::set_time(double t) {
-  if (!has_prescribed_joints() || t == row_time_) return true;
-  Trajectory& trajectory = *prescribed_.trajectory;
-  if (!trajectory(t, row_value_, row_rate_, row_acceleration_)) {
-    control.failure.message = trajectory.failure;
-    return fail(RhsFailure::no_control);
+  if (prescribed_.empty() || t == row_time_) return true;
+  for (PrescribedJoint& joint : prescribed_) {
+    if (joint.is_free) continue;
+    Eigen::Map<Vector> position(&joint.position, 1), rate(&joint.rate, 1), acceleration(&joint.acceleration, 1);
+    if (!(*joint.motion)(t - joint.from, position, rate, acceleration)) {
+      control.failure.message = joint.motion->failure;
+      return fail(RhsFailure::no_control);
+    }
+    joint.position += joint.shift;
+    set_row(joint);
   }
-  row_time_ = t;
-  for (Eigen::Index k = 0; k < row_value_.size(); ++k) {
-    const int row = prescribed_.rows[k];
-    core.row_motion.value(row) = row_value_(k) - prescribed_.offset(k);
-    core.row_motion.rate(row) = row_rate_(k);
-    core.row_motion.acceleration(row) = row_acceleration_(k);
-    row_correction_(row) = -row_acceleration_(k);
+  row_time_ = t, ++row_version_;
+  return true;
+}
+
+void System::read_free_joints(In y) {
+  Eigen::Index at = motion_size + law_size_;
+  for (PrescribedJoint& joint : prescribed_) {
+    if (!joint.can_be_free()) continue;
+    if (joint.is_free && (joint.position != y(at) || joint.rate != y(at + 1))) {
+      joint.position = y(at), joint.rate = y(at + 1), ++row_version_;
+      set_row(joint);
+    }
+    at += 2;
   }
+}
+
+void System::add_to_free_joints(Out y, In step, int at) const {
+  Eigen::Index k = motion_size + law_size_ + at;
+  for (const PrescribedJoint& joint : prescribed_) {
+    if (joint.is_free) y(k) += step(joint.coordinate);
+    if (joint.can_be_free()) k += 2;
+  }
+}
+
+bool System::switch_prescribed_joints(double t, Out y, const Indices& events) {
+  const double due = t + breakpoints_.tolerance;
+  Eigen::Index at = motion_size + law_size_;
+  for (PrescribedJoint& joint : prescribed_) {
+    if (!joint.can_be_free()) continue;
+    if (joint.is_free && !joint.has_ended && joint.ends.time > due && joint.begins.is_due(due, events)) {
+      if (!sync_core(t, y)) return false;
+      write_projected_state(y);
+      const double position = joint.position, rate = joint.rate;
+      joint.is_free = false, joint.from = t, joint.shift = 0.0;
+      release_free_rows();
+      if (!set_time(t)) return false;
+      joint.shift = position - joint.position;
+      row_time_ = std::numeric_limits<double>::quiet_NaN();
+      if (!set_time(t) || !add_impulse(joint, joint.rate - rate, y)) return false;
+      const Eigen::Index count = breakpoints_.times.size();
+      breakpoints_.times.conservativeResize(count + joint.corners.size());
+      breakpoints_.times.tail(joint.corners.size()) = joint.corners.array() + t;
+      std::sort(breakpoints_.times.data(), breakpoints_.times.data() + breakpoints_.times.size());
+    } else if (!joint.is_free && joint.ends.is_due(due, events)) {
+      if (!set_time(t)) return false;
+      joint.is_free = joint.has_ended = true;
+      y(at) = joint.position, y(at + 1) = joint.rate;
+      release_free_rows();
+    }
+    at += 2;
+  }
+  return true;
+}
+
+// The core is at y, with the joint's row already at its new rate.
+bool System::add_impulse(PrescribedJoint& joint, double rate_jump, Out y) {
+  if (rate_jump == 0.0) return true;
+  Vector step(core.n), momentum(core.n);
+  const double before = core.energy(velocity, momentum).kinetic;
+  if (!core.unit_row_response(joint.row, step)) return fail(RhsFailure::rank_lost);
+  step *= rate_jump;
+  const double after = core.energy(velocity + step, momentum).kinetic;
+  add_velocity(y, step);
+  if (work_size_) y(motion_size + law_size_ + free_size_ + int(WorkOf::motors)) += after - before;
+  core.joints.locked.clear();  // friction is bounded and has no impulse
+  resume(row_time_, y);
   return true;
 }
 
@@ -82,24 +184,29 @@ bool System::set_prescribed_torques(double t, Out tau) {
   for (size_t i = 0; i < core.joints.locked.size(); ++i)
     force_.value(core.joints.locked[i]) += core.joints.holding_forces()(static_cast<Eigen::Index>(i));
   core.multipliers(force_.value, acceleration_, lambda_);
-  for (Eigen::Index k = 0; k < row_rate_.size(); ++k) {
-    const double direction = row_rate_(k) > 0.0 ? 1.0 : row_rate_(k) < 0.0 ? -1.0 : 0.0;
-    tau(prescribed_.motors[k]) +=
-        (lambda_(prescribed_.rows[k]) + direction * prescribed_.friction(k)) / prescribed_.gear(k);
+  for (const PrescribedJoint& joint : prescribed_) {
+    if (joint.is_free) continue;
+    const double direction = joint.rate > 0.0 ? 1.0 : joint.rate < 0.0 ? -1.0 : 0.0;
+    tau(joint.motor) += (lambda_(joint.row) + direction * joint.friction) / joint.gear;
   }
   return lambda_.allFinite();
 }
 
 bool System::rhs(double t, In y, Out y_dot) {
-  return coupled_rhs(t, y, y_dot) && (!work_size_ || powers(t, y, y_dot.segment(motion_size + law_size_, work_size_))) &&
+  const int works_at = motion_size + law_size_ + free_size_;
+  return coupled_rhs(t, y, y_dot) && (!work_size_ || powers(t, y, y_dot.segment(works_at, work_size_))) &&
          (!integrand || integrand->rates(y, y_dot));
 }
 
-// The motion and the state of the control law.
+// The motion, the state of the control law, and free joints.
 bool System::coupled_rhs(double t, In y, Out y_dot) {
   if (!set_time(t)) return false;
-  read_law_state(y);
+  read_appended(y);
   if (!motion_rhs(t, y.head(motion_size), y_dot.head(motion_size))) return false;
+  Eigen::Index at = motion_size + law_size_;
+  for (const PrescribedJoint& joint : prescribed_)
+    if (joint.can_be_free())
+      y_dot(at++) = joint.is_free ? joint.rate : 0.0, y_dot(at++) = joint.is_free ? joint.acceleration : 0.0;
   return !law_size_ || control.law_rate(measured(t), y_dot.segment(motion_size, law_size_)) ||
          fail(RhsFailure::no_control);
 }
@@ -118,21 +225,21 @@ bool System::powers(double t, In y, Out power) {
     friction = applied_force_.dot(v_tree);
   }
   if (forces_) power(int(WorkOf::forces)) = forces_->value.dot(v_tree);
-  if (!has_prescribed_joints()) return true;
+  if (prescribed_.empty()) return true;
   motor_torques_.setZero(control.tau.size());
   if (!set_prescribed_torques(t, motor_torques_)) return false;
-  for (Eigen::Index k = 0; k < row_rate_.size(); ++k) {
-    motors += motor_torques_(prescribed_.motors[k]) * prescribed_.gear(k) * row_rate_(k);
-    friction -= prescribed_.friction(k) * std::abs(row_rate_(k));
+  for (const PrescribedJoint& joint : prescribed_) {
+    motors += motor_torques_(joint.motor) * joint.gear * joint.rate;
+    if (!joint.is_free) friction -= joint.friction * std::abs(joint.rate);
   }
   return true;
 }
 
 bool System::jacobian(double t, In y, Matrix& jacobian, long& evaluations) {
   if (!set_time(t)) return false;
-  if (law_size_) {
+  if (law_size_ || free_size_) {
     project_exactly(true);
-    const bool exists = difference_jacobian(t, y.head(motion_size + law_size_), jacobian, evaluations);
+    const bool exists = difference_jacobian(t, y.head(motion_size + law_size_ + free_size_), jacobian, evaluations);
     project_exactly(false);
     if (!exists) return false;
   } else if (!motion_jacobian(t, y.head(motion_size), jacobian, evaluations)) {
@@ -154,7 +261,10 @@ const Vector& System::applied_force(In v) {
 }
 
 bool System::acceleration_with_held_joints(In v, In correction, Out a) {
-  return core.acceleration_with_held_joints(applied_force(v), correction, a) || fail(RhsFailure::rank_lost);
+  if (!core.acceleration_with_held_joints(applied_force(v), correction, a)) return fail(RhsFailure::rank_lost);
+  for (PrescribedJoint& joint : prescribed_)
+    if (joint.is_free) joint.acceleration = a(joint.coordinate);
+  return true;
 }
 
 bool System::acceleration_derivatives(In q_tree, In v, In correction) {

@@ -40,14 +40,28 @@ enum class Accepted {
   rejected,   // the coordinates are singular here
 };
 
-// Joints whose motion is prescribed. Each is a constraint row, joint - trajectory(t) = 0, and its multiplier is the
-// torque of the motor on that joint.
-struct PrescribedJoints {
-  Indices rows, motors;
-  Vector offset;    // of the rows: value of the trajectory at which their residual is zero
-  Vector gear;      // shaft rate by joint rate of each motor
-  Vector friction;  // of the joints; the motor overcomes it
-  std::unique_ptr<Trajectory> trajectory;
+// A joint whose motion is prescribed. It is a constraint row, joint - motion(t) = 0, and its multiplier is the torque of
+// the motor on that joint. Before it begins and after it ends, the joint moves freely: the row then follows the joint,
+// whose position and rate are entries of y, with the acceleration at which the multiplier is zero.
+struct PrescribedJoint {
+  struct Switch {
+    double time;     // s, infinite if there is none
+    Indices events;  // one of them
+    bool exists() const { return !events.empty() || std::isfinite(time); }
+    bool is_due(double t, const Indices& occurred) const;
+  };
+  int coordinate, row, motor;
+  double offset;    // of the row: position at which its residual is zero
+  double gear;      // shaft rate by joint rate of the motor
+  double friction;  // of the joint; the motor overcomes it
+  std::unique_ptr<Trajectory> motion;
+  Vector corners;  // times at which a derivative of the motion jumps
+  Switch begins, ends;
+
+  bool can_be_free() const { return begins.exists() || ends.exists(); }
+  bool is_free = false, has_ended = false;
+  double from = 0.0, shift = 0.0;  // position = shift + motion(t - from)
+  double position = 0.0, rate = 0.0, acceleration = 0.0;
 };
 
 // Instants at which functions of time (desired and prescribed motions, forces) or their derivatives jump. Steps end at
@@ -68,21 +82,27 @@ class System {
   // Append an integrand to y. It must outlive this system.
   void append(Integrand& integrand);
   void integrate_works();
-  int coupled_size() const { return motion_size + law_size_ + work_size_; }  // entries of y before an integrand's
+  // Entries of y before an integrand's.
+  int coupled_size() const { return motion_size + law_size_ + free_size_ + work_size_; }
   bool integrates_works() const { return work_size_ > 0; }
-  auto works(In y) const { return y.segment(motion_size + law_size_, work_size_); }
+  auto works(In y) const { return y.segment(motion_size + law_size_ + free_size_, work_size_); }
   // Set the entries of y behind the motion's at the start.
   void start_appended(Out y);
-  void prescribe(PrescribedJoints joints);
+  void prescribe(std::vector<PrescribedJoint> joints);
+  // Set the prescribed joints to the start of a motion.
+  void start_prescribed_joints(In q_tree, In v_tree);
+  // Begin and end the motions of prescribed joints that are due at t, or at one of these events. A rate that jumps
+  // where a motion begins is caused by an impulse of the joint's motor. False if that fails.
+  bool switch_prescribed_joints(double t, Out y, const Indices& events);
   void set_forces(std::unique_ptr<BodyForces> forces) { forces_ = std::move(forces); }
   const BodyForces* forces() const { return forces_.get(); }
-  void set_breakpoints(Breakpoints breakpoints) { breakpoints_ = std::move(breakpoints); }
+  void set_breakpoints(Breakpoints breakpoints) { breakpoints_ = fixed_breakpoints_ = std::move(breakpoints); }
   double next_breakpoint() const;
   double breakpoint_tolerance() const { return breakpoints_.tolerance; }
   // Begin the segment of smooth functions of time that contains t or begins there, up to the tolerance.
   void start_segment(double t);
-  bool has_prescribed_joints() const { return !prescribed_.rows.empty(); }
-  double row_time() const { return has_prescribed_joints() ? row_time_ : 0.0; }  // of the prescribed motion that is set
+  const std::vector<PrescribedJoint>& prescribed_joints() const { return prescribed_; }
+  long row_version() const { return row_version_; }  // incremented when the motion of rows changes
   // Replace the torques of the motors on prescribed joints by those that make them move as prescribed, at the core's
   // state with its control. False if there is no acceleration.
   bool set_prescribed_torques(double t, Out tau);
@@ -95,9 +115,9 @@ class System {
   // Compute y'. False if it does not exist or is not finite.
   bool rhs(double t, In y, Out y_dot);
   // Set the core and the members below to the state, projected as the formulation requires. False if that fails.
-  bool sync_core(double t, In y) { return read_law_state(y), sync_motion(t, y); }
+  bool sync_core(double t, In y) { return read_appended(y), sync_motion(t, y); }
   // The same without projection, if possible.
-  bool sync_core_unprojected(double t, In y) { return read_law_state(y), sync_motion_unprojected(t, y); }
+  bool sync_core_unprojected(double t, In y) { return read_appended(y), sync_motion_unprojected(t, y); }
   // Read a coordinate (or its rate) from y, unprojected. False if y does not contain it.
   virtual bool read_from_state(In /*y*/, int /*k*/, bool /*of_rate*/, double& /*value*/) const { return false; }
   // Write the projected state of the core, which belongs to y, into y.
@@ -105,14 +125,14 @@ class System {
   // `sync_core` at the start of a motion.
   virtual bool sync_core_at_start(double t, In y) { return sync_core(t, y); }
   // `sync_core` at the state of the last right-hand side, without a new projection.
-  virtual bool sync_core_at_last_rhs(double t, In y) = 0;
+  bool sync_core_at_last_rhs(double t, In y) { return read_appended(y), sync_motion_at_last_rhs(t, y); }
   // Set the core to the configuration of y and compute J. False if y does not contain the configuration.
   virtual bool set_core_configuration(In) { return false; }
   // Distance of q from being a singular chart, at the core's state: smallest singular value of phi_z over |J|,
   // dimensionless. Infinite if the formulation needs no q.
   virtual double coordinate_margin() { return std::numeric_limits<double>::infinity(); }
   double phi_z_margin();
-  virtual Accepted accept_step(double t, Out y, double margin) = 0;
+  Accepted accept_step(double t, Out y, double margin) { return read_appended(y), accept_motion(t, y, margin); }
   // Return to the user's partition. False if its phi_z is singular.
   virtual bool restore_partition(double, Out, bool& changed) { return changed = false, true; }
   // Derivative of the coupled entries of y' with respect to those of y; that of the works is not computed and set to
@@ -165,8 +185,8 @@ class System {
   // if that fails.
   bool correct_locked_joints(Out y, double tolerance, bool& changed);
   // Add to the velocities, and to the coordinates, in y.
-  virtual void add_velocity(Out y, In v) const = 0;
-  virtual void add_displacement(Out y, In step) const = 0;
+  void add_velocity(Out y, In v) const { add_motion_velocity(y, v), add_to_free_joints(y, v, 1); }
+  void add_displacement(Out y, In step) const { add_motion_displacement(y, step), add_to_free_joints(y, step, 0); }
   // Continue from y, where the core is, with another velocity. The history of states is invalid.
   virtual void resume(double, Out) {}
 
@@ -194,7 +214,11 @@ class System {
   MeasuredState measured(double t) { return {t, core, q, q_dot, v_tree, q_dot}; }
 
  protected:
+  virtual void add_motion_velocity(Out y, In v) const = 0;
+  virtual void add_motion_displacement(Out y, In step) const = 0;
   virtual bool sync_motion(double t, In y) = 0;
+  virtual bool sync_motion_at_last_rhs(double t, In y) = 0;
+  virtual Accepted accept_motion(double t, Out y, double margin) = 0;
   virtual bool sync_motion_unprojected(double t, In y) { return sync_motion(t, y); }
   // Whether control or forces need the core at the state.
   bool force_needs_core() const { return control.needs_terms() || forces_ || law_size_; }
@@ -216,23 +240,30 @@ class System {
   AccelerationDerivatives eq_1_;
 
  private:
-  void read_law_state(In y) {
+  void read_appended(In y) {  // the state of the control law and of free joints
     if (law_size_) control.law->state = y.segment(motion_size, law_size_);
+    if (free_size_) read_free_joints(y);
   }
+  void read_free_joints(In y);
+  void add_to_free_joints(Out y, In step, int at) const;  // at = 0: positions, 1: rates
+  bool add_impulse(PrescribedJoint& joint, double rate_jump, Out y);
+  void set_row(const PrescribedJoint& joint);
+  void release_free_rows();
   bool coupled_rhs(double t, In y, Out y_dot);
   bool powers(double t, In y, Out power);
   bool difference_jacobian(double t, In y, Matrix& jacobian, long& evaluations);
 
   bool eq_1_is_valid_ = false;
-  int law_size_ = 0, work_size_ = 0;
+  int law_size_ = 0, free_size_ = 0, work_size_ = 0;
   std::unique_ptr<BodyForces> forces_;
-  Breakpoints breakpoints_;
+  Breakpoints breakpoints_, fixed_breakpoints_;  // the second without those of motions that begin in the run
   Eigen::Index passed_breakpoints_ = 0;
   Vector motor_torques_;
   std::unique_ptr<SmallestSingularValue> phi_z_singular_value_;
-  PrescribedJoints prescribed_;
-  Vector row_value_, row_rate_, row_acceleration_, lambda_;
+  std::vector<PrescribedJoint> prescribed_;
+  Vector lambda_;
   double row_time_ = std::numeric_limits<double>::quiet_NaN();
+  long row_version_ = 0;
   Vector moved_y_, moved_rate_, rate_at_y_, applied_force_, locked_drift_, locked_correction_, acceleration_;
   AppliedForce force_;
   Matrix responses_;
