@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
+from time import perf_counter
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,7 +19,14 @@ from ckc_pin.cli.output import Spinner, error_console, make_folder, print_json, 
 from ckc_pin.cli.signals import interrupts
 from ckc_pin.errors import InputError
 
+if TYPE_CHECKING:
+    from ckc_pin.formats.exporting import Exported
+
 __all__ = ["export", "import_", "new"]
+
+MUJOCO_TIME_STEPS_S = (1e-3, 1e-4, 1e-5)
+MAX_MUJOCO_DEVIATION = 1e-3  # rad or m
+MAX_COMPARISON_S = 3.0  # a smaller time step is not tried after a longer comparison
 
 TEMPLATES = Path(__file__).parent / "new_files"  # "NAME" in their names and texts is replaced by the mechanism's name
 VALID_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -104,7 +114,10 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
     from ckc_pin.formats import exporting
 
     with Spinner(f"export of {mechanism}"):
-        exported = exporting.export(ckc_pin.load(mechanism), to)
+        loaded = ckc_pin.load(mechanism)
+        exported = exporting.export(loaded, to)
+        if to == "mjcf" and find_spec("mujoco") is not None:
+            exported = _choose_time_step(loaded, exported)
     paths = [] if out is None else [exporting.write(exported, out, overwrite)]
     if as_json:
         text = {} if paths else {"text": exported.text}
@@ -117,3 +130,24 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
         print(exported.text)
     for difference in exported.differences:
         (print if paths else error_console().print)(f"differs: {difference}")
+
+
+def _choose_time_step(mechanism: ckc_pin.Mechanism, exported: Exported) -> Exported:
+    """Export to MuJoCo with the largest of a few time steps at which its motion agrees, and say how well it does."""
+    from ckc_pin.analysis.precision.mujoco import measure_deviation
+    from ckc_pin.formats import exporting
+
+    for time_step in MUJOCO_TIME_STEPS_S:
+        exported = exporting.export(mechanism, "mjcf", time_step=time_step)
+        started = perf_counter()
+        try:
+            deviation, duration = measure_deviation(mechanism, exported.text)
+        except (ckc_pin.CkcError, ValueError) as error:
+            exported.differences.append(f"not compared with MuJoCo's motion: {' '.join(str(error).split())}")
+            return exported
+        if deviation <= MAX_MUJOCO_DEVIATION or perf_counter() - started > MAX_COMPARISON_S:
+            break
+    exported.differences.append(
+        f"measured within {duration:g} s, from a start at 1 rad/s: {deviation:.1g} rad or m, at the file's time step"
+    )
+    return exported

@@ -35,7 +35,7 @@ class Exported:
     differences: list[str]
 
 
-def export(mechanism: Mechanism, to: str) -> Exported:
+def export(mechanism: Mechanism, to: str, **options: float) -> Exported:
     """Convert a mechanism, in its assembled configuration, to another program's format.
 
     Parameters
@@ -43,6 +43,8 @@ def export(mechanism: Mechanism, to: str) -> Exported:
     mechanism : Mechanism
     to : str
         "mjcf": a MuJoCo model.
+    **options
+        Of the format. "mjcf": `time_step`, s.
 
     Raises
     ------
@@ -51,7 +53,7 @@ def export(mechanism: Mechanism, to: str) -> Exported:
     """
     if to not in FORMATS:
         raise InputError(f"export: unknown format {to!r}; expected one of {', '.join(FORMATS)}")
-    text, differences = FORMATS[to](mechanism)
+    text, differences = FORMATS[to](mechanism, **options)
     return Exported(re.sub(r"[^\w.-]+", "_", mechanism.name) + ".xml", text, differences)
 
 

@@ -83,9 +83,7 @@ def rollouts(values: Array, threads: int) -> Iterator[tuple[str, float, float, A
         states.append(state)
     initial = np.array(states)
     with Rollout(nthread=threads) as pool:
-        solref, solimp = model.eq_solref.copy(), model.eq_solimp.copy()
         for k, integrator, stiffness in product(range(7), INTEGRATORS, STIFFNESSES):
-            model.eq_solref[:], model.eq_solimp[:] = solref, solimp
             steps = round(100 * 2**k * T_END)
             configure_model(model, integrator, stiffness, T_END / steps)
             started = time.perf_counter()

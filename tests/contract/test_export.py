@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +100,9 @@ def spatial(tmp_path_factory: pytest.TempPathFactory) -> Mechanism:
 class MujocoModel:
     """MuJoCo's model of a mechanism, set to Pinocchio's states."""
 
-    def __init__(self, mechanism: Mechanism) -> None:
+    def __init__(self, mechanism: Mechanism, text: str = "") -> None:
         self.tree = mechanism.tree
-        self.model: Any = mujoco.MjModel.from_xml_string(export(mechanism, "mjcf").text)
+        self.model: Any = mujoco.MjModel.from_xml_string(text or export(mechanism, "mjcf").text)
         self.data: Any = mujoco.MjData(self.model)
 
     def put(self, q_tree: Any, v_tree: Any) -> Any:
@@ -211,6 +212,26 @@ def test_swing_of_the_five_bar_agrees_with_stiff_constraints() -> None:
     ends = [mujoco_model.data.joint(name).qpos[0] for name in run.coordinates]
     assert np.abs(run.q_tree[-1] - run.q_tree[0]).max() > 0.1
     assert np.abs(ends - run.q_tree[-1]).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["five_bar", "slider_crank", "delta", "flyball", "two_ur5"])
+def test_the_exported_file_moves_as_the_mechanism(name: str, tmp_path: Path) -> None:
+    """With the time step, method and stiffness of the file that the command writes."""
+    text = ckc("export", name, "--to", "mjcf", "--out", str(tmp_path)).out
+    stated = re.search(r"measured within 1 s, from a start at 1 rad/s: (\S+) rad or m", text)
+    assert stated
+    assert float(stated[1]) < 1e-3
+    mechanism = load(name)
+    start = {"at": "assembled", "q_dot": dict.fromkeys(mechanism.independent, 0.7)}
+    run = ckc_pin.simulate(mechanism, t_end=0.5, initial=start)
+    mujoco_model = MujocoModel(mechanism, (tmp_path / f"{name}.xml").read_text())
+    mujoco_model.put(mechanism.tree.from_coordinates(run.q_tree[0]), run.v_tree[0])
+    while mujoco_model.data.time < 0.5 - 1e-9:
+        mujoco.mj_step(mujoco_model.model, mujoco_model.data)
+    joints = [name for name in run.coordinates if "." not in name]
+    ends = {name: mujoco_model.data.joint(name).qpos[0] for name in joints}
+    assert max(abs(run[name][-1] - run[name][0]) for name in joints) > 0.05
+    assert max(abs(end - run[name][-1]) for name, end in ends.items()) < 1e-3
 
 
 @pytest.fixture(params=[*shipped(), "spatial"], scope="module")

@@ -14,6 +14,7 @@ import pinocchio as pin
 from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion, motion_without_data, starts_off_manifold
 from ckc_pin.base.arrays import Array
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.scene import Scene
 
@@ -25,6 +26,7 @@ __all__ = [
     "explain_unsupported",
     "load_model",
     "make_program",
+    "measure_deviation",
     "run_mujoco",
 ]
 
@@ -32,7 +34,10 @@ DYNAMICS_TOLERANCE = 1e-6  # relative; of mass matrix and bias, to check that bo
 LARGEST_STEP, HALVINGS = 1e-2, 9  # of the span, at most 2 s of it; how often this step is halved
 INTEGRATORS = ("implicitfast", "RK4")
 STIFFNESSES = ("default", "solref 2 dt")  # MuJoCo's default, and the stiffest that its manual allows
+DEFAULT_SOLREF, DEFAULT_SOLIMP = [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]  # MuJoCo's
 DISABLED_FEATURES = ("AUTORESET", "CONTACT", "SENSOR")  # AUTORESET would restart a run that diverged
+# Of the motion by which an exported model is compared.
+DEVIATION_TIME_S, DEVIATION_OUTPUT_S, DEVIATION_RTOL = 1.0, 0.1, 1e-9
 OUT_OF_BUDGET = "the budget is used up; give a larger one"
 
 
@@ -81,12 +86,10 @@ def run_mujoco(
 def _run_settings(
     model: Any, program: FixedStepProgram, t: Array, deadline: float
 ) -> Iterator[tuple[str, float, Motion]]:
-    solref, solimp = model.eq_solref.copy(), model.eq_solimp.copy()
     interval, instants, too_slow = float(t[1]), len(t) - 1, set[str]()
     for k, (integrator, stiffness) in product(range(HALVINGS), product(INTEGRATORS, STIFFNESSES)):
         steps = max(1, round(interval / (LARGEST_STEP * min(2.0, float(t[-1])) / 2**k)))
         method, dt = f"{integrator}, {stiffness}", interval / steps
-        model.eq_solref[:], model.eq_solimp[:] = solref, solimp
         configure_model(model, integrator, stiffness, dt)
         if method in too_slow or program.estimate_wall_s(steps, instants) > deadline - perf_counter():
             too_slow.add(method)
@@ -125,7 +128,9 @@ def configure_model(model: Any, integrator: str, stiffness: str, dt: float) -> N
 
     model.opt.timestep = dt
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    if stiffness != "default":
+    if stiffness == "default":
+        model.eq_solref[:], model.eq_solimp[:] = DEFAULT_SOLREF, DEFAULT_SOLIMP
+    else:
         model.eq_solref[:] = [float(stiffness.split()[1]) * dt, 1.0]
         model.eq_solimp[:] = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
@@ -143,6 +148,46 @@ def make_program(model: Any, mechanism: Mechanism, state: tuple[Array, Array]) -
     return FixedStepProgram(
         reset, lambda steps: mujoco.mj_step(model, data, nstep=steps), lambda: states.get_state(data)
     )
+
+
+def measure_deviation(mechanism: Mechanism, mjcf: str) -> tuple[float, float]:
+    """Compare a motion in a MuJoCo model, with its own time step, to the DAE.
+
+    The motion starts as assembled, with 1 rad/s (1 size/s of slides) in each independent coordinate, without torques.
+
+    Returns
+    -------
+    deviation : float
+        Largest difference of a coordinate, rad or m; of a free root, of its pose. Infinite if MuJoCo diverges.
+    duration : float
+        Duration of the motion, s: 1 s, or until the DAE stops.
+
+    Raises
+    ------
+    CkcError
+        The motion cannot be computed.
+    """
+    import mujoco
+
+    rates = {name: float(mechanism.tree.step_scale[mechanism.tree.index[name]]) for name in mechanism.independent}
+    start = {"at": "assembled", "q_dot": rates}
+    scene = Scene(
+        mechanism, t_end=DEVIATION_TIME_S, formulation="dae", initial=start,
+        solver={"rtol": DEVIATION_RTOL, "output_dt": DEVIATION_OUTPUT_S},
+    )  # fmt: skip
+    run, model = simulate(scene), load_model(mjcf)
+    data, states, deviation = mujoco.MjData(model), StateMap(mechanism, model), 0.0
+    tree = mechanism.tree
+    states.set_state(data, tree.from_coordinates(run.q_tree[0]), run.v_tree[0])
+    for t, q_tree in zip(run.t[1:], run.q_tree[1:], strict=True):
+        while data.time < t - model.opt.timestep / 2:
+            mujoco.mj_step(model, data)
+        if not np.all(np.isfinite(data.qpos)):
+            return np.inf, float(run.t[-1])
+        q_mujoco = tree.from_coordinates(states.get_state(data)[0])
+        difference = tree.difference(tree.from_coordinates(q_tree), q_mujoco)
+        deviation = max(deviation, float(np.abs(difference).max()))
+    return deviation, float(run.t[-1])
 
 
 def _compare_dynamics(mechanism: Mechanism, model: Any, state: tuple[Array, Array]) -> float:

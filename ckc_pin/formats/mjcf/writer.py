@@ -20,8 +20,11 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
-__all__ = ["place_in_plane", "to_mjcf"]
+__all__ = ["DEFAULT_TIME_STEP_S", "place_in_plane", "to_mjcf"]
 
+DEFAULT_TIME_STEP_S = 1e-3
+SOLREF_STEPS = 2  # time constant of the loops in time steps, the shortest that MuJoCo's manual allows
+SOLIMP = np.array([0.9999, 0.9999, 0.001, 0.5, 2.0])  # the hardest constraints that MuJoCo's manual allows
 MIN_MASS = 1e-12  # kg and kg m^2; MuJoCo refuses moving bodies with less
 TRIANGLE_TOLERANCE = 1e-9  # relative; of the triangle inequality between principal moments
 STICK_RADIUS = 0.03  # of the mechanism's size
@@ -30,11 +33,12 @@ PLANE_TOLERANCE = 1e-9  # of the mechanism's size; how far a planar loop may lea
 PLANE_CONFIGURATIONS = 5  # random ones, at which this is checked
 
 
-def to_mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
+def to_mjcf(mechanism: Mechanism, time_step: float = DEFAULT_TIME_STEP_S) -> tuple[str, list[str]]:
     """Return a mechanism as a MuJoCo model, and how the model's motion differs.
 
     Joints, bodies and motors have the mechanism's names. Body frames are Pinocchio's joint frames. The key frame
-    "assembled" is the assembled configuration.
+    "assembled" is the assembled configuration. Loops are as stiff as the time step (s) allows, with MuJoCo's
+    Runge-Kutta method. Its Jacobian is dense, because MuJoCo 4.0.0 factorizes a sparse one wrongly (its issue 3767).
 
     Raises
     ------
@@ -43,10 +47,16 @@ def to_mjcf(mechanism: Mechanism) -> tuple[str, list[str]]:
     """
     root = Element("mujoco", model=mechanism.name)
     SubElement(root, "compiler", angle="radian", autolimits="false")
-    SubElement(root, "option", gravity=_format(mechanism.tree.model.gravity.linear))
+    options = {"timestep": _format(time_step), "integrator": "RK4", "jacobian": "dense"}
+    SubElement(root, "option", options | {"gravity": _format(mechanism.tree.model.gravity.linear)})
+    stiffness = {"solref": _format(np.array([SOLREF_STEPS * time_step, 1.0])), "solimp": _format(SOLIMP)}
+    SubElement(SubElement(root, "default"), "equality", stiffness)
     world = SubElement(root, "worldbody")
     bodies, order = _add_bodies(mechanism, world)
-    differences = ["loops are soft constraints in MuJoCo; adjust solref and solimp of <equality>, and the time step"]
+    differences = [
+        f"loops are soft constraints in MuJoCo; their time constant (solref) is {SOLREF_STEPS} time steps of "
+        f"{time_step:g} s, so change both together"
+    ]
     differences += _add_inertials(mechanism, bodies)
     sites = _Sites(bodies)
     for name, frame in mechanism.points.items():
