@@ -27,7 +27,7 @@ from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
-from ckc_pin.mechanism.rows import RelativeLog
+from ckc_pin.mechanism.rows import Curved, RelativeLog
 
 __all__ = ["Library", "cache_folder", "compile_terms", "explain_too_large", "find_compiled_terms"]
 
@@ -194,7 +194,8 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_deriv
 
 def _is_constant(group: object, name: str) -> bool:
     """Return whether an attribute of a group of rows is written into the code as a constant."""
-    return isinstance(group, RelativeLog) or name in ("out", "pair", "direction", "a", "b")
+    is_curve = isinstance(group, Curved) and name not in ("matrix", "offset")
+    return isinstance(group, RelativeLog) or is_curve or name in ("out", "pair", "direction", "a", "b")
 
 
 @cache

@@ -14,11 +14,14 @@ from dataclasses import dataclass
 from math import comb
 from typing import Any
 
+import numpy as np
+
+from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.arguments import Arguments, constant
 from ckc_pin.codegen.bodies import ConfigurationSymbols, MovingBody, cross, dot, multiply
 from ckc_pin.codegen.branches import BranchAxes
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog
 
 __all__ = ["RowTerms", "row_terms"]
 
@@ -148,10 +151,16 @@ def row_terms(
                     a, b = pairs[pair]
                     put(int(out), _distance(a.motion_from(b, a.body.axes), arguments.number("length", out)))
             case Affine():
-                for out in group.out:
-                    row = cs.horzcat(*(arguments.number("affine", out, k) for k in range(n)))
-                    value = multiply(row, cs.vertcat(*(configuration.q[k] for k in place)))
-                    put(int(out), (value - arguments.number("affine_offset", out), row, 0))
+                for k, out in enumerate(group.out):
+                    row = cs.horzcat(*(arguments.number("affine", out, j) for j in range(n)))
+                    value = multiply(row, cs.vertcat(*(configuration.q[j] for j in place)))
+                    value, drift = value - arguments.number("affine_offset", out), cs.SX(1, 1)
+                    if isinstance(group, Curved):
+                        at = int(group.coordinate[k])
+                        p, p_slope, p_curvature = _curve(group, k, configuration.q[place[at]])
+                        value, drift, row = value - p, -p_curvature * v[at] ** 2, cs.SX(row)
+                        row[at] = -p_slope
+                    put(int(out), (value, row, drift))
             case RelativeLog():
                 for k in range(len(group.joint_a)):
                     a, b = bodies[group.joint_a[k]], bodies[group.joint_b[k]]
@@ -217,6 +226,27 @@ def _distance(r: _MovingVector, length: Any) -> tuple[Any, Any, Any]:
         multiply(r.value.T / length, r.jacobian),
         (dot(r.rate, r.rate) + dot(r.value, r.acceleration)) / length,
     )
+
+
+def _curve(group: Curved, k: int, x: Any) -> tuple[Any, Any, Any]:
+    """Return the piecewise polynomial of row k of a group and its first two derivatives at x."""
+    import casadi as cs
+
+    pieces = int(np.isfinite(group.breaks[k]).sum()) + 1
+
+    def select(numbers: Array) -> Any:
+        value = cs.SX(numbers[0])
+        for at, number in zip(group.breaks[k], numbers[1:], strict=False):
+            value = cs.if_else(x >= at, number, value)
+        return value
+
+    s = x - select(group.origins[k, :pieces])
+    powers = [select(column) for column in group.coefficients[k, :pieces].T]
+    values = []
+    for _ in range(3):
+        values.append(_series(powers or [cs.SX(1, 1)], s))
+        powers = [i * c for i, c in enumerate(powers)][1:]
+    return values[0], values[1], values[2]
 
 
 def _relative_log(a: MovingBody, b: MovingBody, rotation_a: Any, rotation_b: Any, n: int) -> tuple[Any, Any]:

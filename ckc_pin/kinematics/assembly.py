@@ -13,6 +13,7 @@ from ckc_pin.errors import MechanismError
 from ckc_pin.kinematics.closing import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Assembly, close_loops, find_nearby
 from ckc_pin.kinematics.loop_types import describe_locking_loops, list_closing_types
 from ckc_pin.kinematics.sigma import newton, sigma
+from ckc_pin.mechanism.couplings import coefficients_of, coupled_joints, curve_of
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
@@ -116,31 +117,34 @@ def _create_mechanism(linkage: Linkage, closed: Assembly, independent: tuple[str
 
 
 def _apply_couplings(linkage: Linkage, guess: Array) -> Array:
-    """Return a guess that satisfies the couplings: the follower of each one gets the value that its master implies.
+    """Return a guess that satisfies the couplings: the first joint of each one gets the value that the others imply.
 
-    The master follows instead if only the follower has an entry in q_guess, and neither if both have one.
+    If it has an entry in q_guess, the next joint without one follows instead, and none if all have one.
     """
     tree, guess = linkage.tree, guess.copy()
     placed, pending = set(linkage.spec.q_guess), list(linkage.couplings)
     while pending:
         coupling = _next_coupling(pending, placed)
         pending.remove(coupling)
-        joint, other = tree.index[coupling.joint], tree.index[coupling.other]
-        if coupling.joint not in placed:
-            guess[joint] = coupling.ratio * guess[other] + coupling.offset
-        elif coupling.other not in placed and coupling.ratio != 0.0:
-            guess[other] = (guess[joint] - coupling.offset) / coupling.ratio
-        placed |= {coupling.joint, coupling.other}
+        coefficients, curve = coefficients_of(coupling), curve_of(coupling)
+        follower = next((x for x in coupled_joints(coupling) if x not in placed and coefficients.get(x)), None)
+        if follower is not None:
+            total = (
+                coupling.offset if curve is None else coupling.offset + curve(guess[tree.index[str(coupling.other)]])
+            )
+            total -= sum(x * guess[tree.index[name]] for name, x in coefficients.items() if name != follower)
+            guess[tree.index[follower]] = total / coefficients[follower]
+        placed |= set(coupled_joints(coupling))
     return guess
 
 
 def _next_coupling(pending: list[CouplingSpec], placed: set[str]) -> CouplingSpec:
     """Return a coupling of a joint whose value is known, else one whose master follows no other joint."""
     for coupling in pending:
-        if coupling.joint in placed or coupling.other in placed:
+        if placed.intersection(coupled_joints(coupling)):
             return coupling
-    followers = {coupling.joint for coupling in pending}
-    return next((coupling for coupling in pending if coupling.other not in followers), pending[0])
+    followers = {coupled_joints(coupling)[0] for coupling in pending}
+    return next((x for x in pending if followers.isdisjoint(coupled_joints(x)[1:])), pending[0])
 
 
 def _restore_guess(linkage: Linkage, mechanism: Mechanism) -> Mechanism:

@@ -15,7 +15,7 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, IntArray, lazy
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
+from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = ["ManyPoses", "difference_many", "evaluate_closure", "integrate_many", "join_closures"]
@@ -52,7 +52,12 @@ def evaluate_closure(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array
 def _evaluate(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Array]:
     if isinstance(group, Affine):
         phi = pose.configurations[:, pose.tree.q_index] @ group.matrix.T - group.offset
-        return phi, np.broadcast_to(group.matrix, (pose.count, *group.matrix.shape))
+        jacobian = np.broadcast_to(group.matrix, (pose.count, *group.matrix.shape))
+        if isinstance(group, Curved):
+            x, jacobian = pose.configurations[:, pose.tree.q_index[group.coordinate]], jacobian.copy()
+            phi = phi - group.curve(x, 0)
+            jacobian[:, np.arange(len(group.out)), group.coordinate] -= group.curve(x, 1)
+        return phi, jacobian
     copies = _repeat(group, closure, pose)
     shape = (pose.count, len(group.out))
     return copies.phi(pose).reshape(shape), copies.jacobian(pose).reshape(*shape, pose.tree.n)

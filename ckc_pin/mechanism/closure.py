@@ -9,9 +9,17 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.errors import MechanismError
+from ckc_pin.mechanism.couplings import (
+    PiecewiseCurve,
+    coefficients_of,
+    coupling_name,
+    curve_of,
+    stack_curves,
+    validate_coupling,
+)
 from ckc_pin.mechanism.frames import Frame, Frames
 from ckc_pin.mechanism.pose import Anchors, BodyPose, Pose, Rate
-from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog, Rows
+from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.spec import CouplingSpec, LoopSpec, LoopType
 from ckc_pin.mechanism.tree import Tree
 
@@ -192,6 +200,7 @@ class ClosureBuilder:
         self._dots: list[tuple[int, int, int]] = []  # row, a, b
         self._distances: list[tuple[int, int, float]] = []  # row, pair, length
         self._affine: list[tuple[int, Array, float]] = []  # row, coefficients, offset
+        self._curved: list[tuple[int, Array, float, int, PiecewiseCurve]] = []  # as affine, coordinate, curve
         self._logs: list[tuple[list[int], Frame, Frame]] = []
 
     def add_loop(self, loop: LoopSpec) -> None:
@@ -236,15 +245,25 @@ class ClosureBuilder:
             self._logs.append(([self._add_row(loop.name, label) for label in ("rx", "ry", "rz")], a, b))
 
     def add_coupling(self, coupling: CouplingSpec) -> None:
-        """Add the row joint - ratio * other - offset = 0."""
-        name = f"{coupling.joint}~{coupling.other}"
+        """Add the row of a coupling: sum of coefficient * joint - curve(other) - offset = 0.
+
+        Raises
+        ------
+        MechanismError
+            The coupling is incomplete, contradictory, or names a joint that is not there.
+        """
+        validate_coupling(coupling)
+        name, curve = coupling_name(coupling), curve_of(coupling)
         where = f"coupling {name!r}"
-        joint, other = (self.tree.joint_index(x, where) for x in (coupling.joint, coupling.other))
-        if joint == other:
-            raise MechanismError(f"{where}: a joint cannot be coupled to itself")
         coefficients = np.zeros(self.tree.n)
-        coefficients[joint], coefficients[other] = 1.0, -coupling.ratio
-        self._affine.append((self._add_row(name, "coupling"), coefficients, coupling.offset))
+        for joint, coefficient in coefficients_of(coupling).items():
+            coefficients[self.tree.joint_index(joint, where)] = coefficient
+        row = self._add_row(name, "coupling")
+        if curve is None:
+            self._affine.append((row, coefficients, coupling.offset))
+        else:
+            other = self.tree.joint_index(str(coupling.other), where)
+            self._curved.append((row, coefficients, coupling.offset, other, curve))
 
     def add_prescribed(self, joint: str, value: float) -> None:
         """Add the row joint - value = 0, whose value the native loop moves in time."""
@@ -267,6 +286,10 @@ class ClosureBuilder:
         if self._affine:
             rows, coefficients, offsets = zip(*self._affine, strict=True)
             groups.append(Affine(np.array(rows, np.intp), np.array(coefficients), np.array(offsets)))
+        if self._curved:
+            rows, coefficients, offsets, others, curves = zip(*self._curved, strict=True)
+            linear = np.array(rows, np.intp), np.array(coefficients), np.array(offsets)
+            groups.append(Curved(*linear, np.array(others, np.intp), *stack_curves(curves)))
         if self._logs:
             out = np.array([row for rows, *_ in self._logs for row in rows], np.intp)
             a, b = [x for _, x, _ in self._logs], [x for *_, x in self._logs]

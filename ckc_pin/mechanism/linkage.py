@@ -85,6 +85,9 @@ class Linkage:
             builder.add_loop(loop)
         mimic = [CouplingSpec(joint=a, other=b, ratio=r, offset=c) for a, b, r, c in urdf.mimic]
         self.couplings = (*spec.coupling, *mimic)
+        names = [coupling.name for coupling in self.couplings if coupling.name is not None]
+        if len(set(names)) < len(names):
+            raise MechanismError(f"coupling: two couplings have the same name, of {', '.join(names)}")
         for coupling in self.couplings:
             builder.add_coupling(coupling)
         for joint, value in (prescribed or {}).items():

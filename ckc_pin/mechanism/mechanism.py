@@ -16,6 +16,7 @@ from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.closure import PRESCRIBED_ROW
 from ckc_pin.mechanism.configuration import Kinematics, Partition
+from ckc_pin.mechanism.couplings import describe_coupling
 from ckc_pin.mechanism.files import local_texts
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.linkage import Linkage
@@ -229,7 +230,7 @@ class Mechanism(HasSummary):
         """Return closure, loops, coordinates, motors, assembled configuration, points and warnings."""
         tree = self.tree
         loops = [f"{loop.name} ({loop.type})" for loop in self.spec.loop]
-        loops += [f"{one.joint} = {one.ratio:g} {one.other} + {one.offset:g}" for one in self.spec.coupling]
+        loops += [describe_coupling(coupling) for coupling in self.spec.coupling]
         rows: list[Row] = [
             ("closure", f"{self.closure.rows} rows of rank {self.rank}"),
             ("loops", loops or "none"),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.mechanism.couplings import find_coupling
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, Value, split_component, split_name, values_of
 from ckc_pin.mechanism.rows import Affine, Distance
@@ -242,12 +243,15 @@ class _Members:
         self._set("length", self.mechanism.closure.names.index((carrier, "length")), column)
 
     def _add_coupling(self, name: str, carrier: str, key: str, column: Numbers) -> None:
-        coupling = self.mechanism.spec.coupling[int(carrier)]
-        row = self.mechanism.closure.names.index((f"{coupling.joint}~{coupling.other}", "coupling"))
+        number = find_coupling(self.mechanism.spec, carrier)
+        row = [k for k, (_, kind) in enumerate(self.mechanism.closure.names) if kind == "coupling"][number]
         if key == "offset":
             self._set("affine_offset", row, column)
+        elif key == "ratio":
+            other = str(self.mechanism.spec.coupling[number].other)
+            self._set("affine", (row, self.mechanism.tree.index[other]), -column)
         else:
-            self._set("affine", (row, self.mechanism.tree.index[coupling.other]), -column)
+            self._set("affine", (row, self.mechanism.tree.index[key.removeprefix("joints.")]), column)
 
     def _add_spring(self, name: str, carrier: str, key: str, column: Numbers) -> None:
         spring = self.mechanism.spec.spring[int(carrier)]

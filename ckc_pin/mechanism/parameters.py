@@ -46,7 +46,7 @@ VECTORS = ("gravity", "com", "xyz", "rpy")  # keys of three numbers each
 UNBOUNDED = 1e300  # absolute value of a limit of the URDF that stands for no limit
 OF_ENTRY = {
     "loop": ("frame_a.xyz", "frame_a.rpy", "frame_b.xyz", "frame_b.rpy", "length"),
-    "coupling": ("ratio", "offset"),
+    "coupling": ("ratio", "offset", "joints"),
     "spring": ("stiffness", "damping", "rest_length", "rest", "frame_a.xyz", "frame_b.xyz"),
     "force": ("value",),
     "motor": ("ratio", "rotor_inertia", "torque_limit", "speed_limit"),
@@ -252,6 +252,9 @@ def _of_file(spec: MechanismSpec) -> Iterator[tuple[str, Value]]:
                     if frame is not None:
                         at = (0.0, 0.0, 0.0) if isinstance(frame, str) else frame[last]
                         yield f"{kind}.{_called(kind, k, entry)}.{key}", _three(at)
+                elif key == "joints":
+                    for joint, coefficient in entry[key].items():
+                        yield f"{kind}.{_called(kind, k, entry)}.{key}.{joint}", float(coefficient)
                 elif _has(kind, entry, key):
                     yield f"{kind}.{_called(kind, k, entry)}.{key}", float(entry[key] or 0.0)
 
@@ -265,8 +268,9 @@ def _has(kind: str, entry: Mapping[str, Any], key: str) -> bool:
 
 
 def _called(kind: str, k: int, entry: Mapping[str, Any]) -> str:
-    """Name of an entry: loops and motors have names, the other tables are numbered from 0."""
-    return str({"loop": entry.get("name"), "motor": entry.get("name") or entry.get("joint")}.get(kind) or k)
+    """Name of an entry: loops and motors have names, couplings may have one, and other tables are numbered from 0."""
+    names = {"loop": entry.get("name"), "motor": entry.get("name") or entry.get("joint"), "coupling": entry.get("name")}
+    return str(names.get(kind) or k)
 
 
 def _carrier(name: str) -> str:
@@ -295,6 +299,9 @@ def split_component(name: str) -> tuple[str, int]:
 def split_name(name: str) -> tuple[str, str, str]:
     """Split the name of a parameter into root, carrier and key: ("link", "rod", "mass")."""
     root, _, rest = name.partition(".")
+    if root == "coupling" and ".joints." in rest:
+        carrier, _, joint = rest.partition(".joints.")
+        return root, carrier, f"joints.{joint}"
     key = max((key for key in _keys(root) if rest.endswith(f".{key}")), key=len, default="")
     return root, rest.removesuffix(f".{key}"), key
 
@@ -346,8 +353,8 @@ def _entry_of_joint(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 def _change_entry(kind: str, entries: list[dict[str, Any]], carrier: str, key: str, value: Value) -> None:
     entry = next(entry for k, entry in enumerate(entries) if _called(kind, k, entry) == carrier)
-    table, _, last = key.rpartition(".")
-    if not table:
+    table, _, last = key.partition(".")
+    if not last:
         entry[key] = value
         return
     if isinstance(entry[table], str):

@@ -1,6 +1,6 @@
 """Primitives of constraint rows: residual phi, constraint Jacobian J and the time derivative of J.
 
-Every loop type is a combination of these five primitives. A primitive holds all rows of its kind and evaluates them
+Every loop type is a combination of these six primitives. A primitive holds all rows of its kind and evaluates them
 with array operations. It refers to points and directions of the closure's `Anchors` by number, and reads them from a
 `Pose` and a `Rate`.
 
@@ -14,6 +14,7 @@ primitive       phi                                              used by
 `Dot`           a . b, two directions fixed in links             hinge, cylindrical, universal
 `Distance`      (r . r - L^2) / (2 L), r = p_A - p_B             distance
 `Affine`        A q' - c                                         coupling, mimic joint
+`Curved`        A q' - c - p(q'_k), a piecewise polynomial p     coupling by a polynomial or a table
 `RelativeLog`   log(R_A^T R_B), three rows                       prismatic, weld
 ==============  ===============================================  ==================================
 
@@ -38,6 +39,7 @@ from ckc_pin.mechanism.tree import Tree
 __all__ = [
     "Affine",
     "Component",
+    "Curved",
     "Distance",
     "Dot",
     "RelativeLog",
@@ -180,6 +182,41 @@ class Affine(Immutable):
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         return np.zeros_like(self.matrix)
+
+
+@dataclass(frozen=True)
+class Curved(Affine):
+    """A q' - c - p(q'_k), where p is a piecewise polynomial of one coordinate, which A does not involve."""
+
+    coordinate: IntArray  # (rows,)
+    breaks: Array  # (rows, pieces - 1), padded with infinity
+    origins: Array  # (rows, pieces)
+    coefficients: Array  # (rows, pieces, degree + 1), of the powers of x - origin
+
+    def curve(self, x: Array, order: int) -> Array:
+        """Return the derivative of this order of each row's p at coordinates x, (..., rows) each."""
+        piece = np.sum(x[..., None] >= self.breaks, axis=-1)
+        row = np.arange(len(self.out))
+        polynomial = np.moveaxis(self.coefficients[row, piece], -1, 0)
+        derivative = np.polynomial.polynomial.polyder(polynomial, order)
+        return np.asarray(np.polynomial.polynomial.polyval(x - self.origins[row, piece], derivative, tensor=False))
+
+    def _x(self, pose: Pose) -> Array:
+        return pose.q_tree[pose.tree.q_index[self.coordinate]]
+
+    def _scatter(self, values: Array) -> Array:
+        matrix = np.zeros_like(self.matrix)
+        matrix[np.arange(len(self.out)), self.coordinate] = values
+        return matrix
+
+    def phi(self, pose: Pose) -> Array:
+        return super().phi(pose) - self.curve(self._x(pose), 0)
+
+    def jacobian(self, pose: Pose) -> Array:
+        return self.matrix - self._scatter(self.curve(self._x(pose), 1))
+
+    def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
+        return self._scatter(-self.curve(self._x(pose), 2) * rate.v[self.coordinate])
 
 
 @dataclass(frozen=True)

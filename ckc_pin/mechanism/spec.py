@@ -63,27 +63,53 @@ Frame = Name | FrameSpec
 
 
 class CouplingSpec(FileStruct, frozen=True):
-    """A gear between two joints: joint = ratio * other + offset.
+    """A gear, a nonlinear transmission, or a linear relation between joints of one freedom.
+
+    It has one of four forms:
+
+    - ``joint``, ``other`` and ``ratio``: joint = ratio * other + offset.
+    - ``joint``, ``other`` and ``polynomial``: joint = c_0 + c_1 other + c_2 other² + ... + offset.
+    - ``joint``, ``other`` and ``table``: joint = s(other) + offset, where s is the not-a-knot quintic spline through
+      the points of the table, or their polynomial if there are at most six. Its first four derivatives are continuous.
+      Beyond the first and the last point, s keeps the second derivative that it has there.
+    - ``joints``: the sum of coefficient * joint over any number of joints equals offset.
 
     Attributes
     ----------
+    name
+        Name of the coupling, for its parameters and multipliers. Default: the number of the table for parameters, and
+        the names of the joints for multipliers.
+        ``name = "waist"``
     joint
-        The joint a in a = ratio * b + offset.
+        The joint a that follows.
         ``joint = "wheel"``
     other
-        The joint b.
+        The joint b that it follows.
         ``other = "pinion"``
     ratio : unit of a per unit of b
         Gear ratio, with its sign.
         ``ratio = -0.5``
+    polynomial : unit of a per power of the unit of b
+        Coefficients of the powers of b, the constant first.
+        ``polynomial = [0.0, 1.0, -0.3]``
+    table : rad, m
+        Points [b, a] of a smooth curve, with increasing b; at least three.
+        ``table = [[-0.5, -0.4], [0.0, 0.0], [0.5, 0.6]]``
+    joints
+        Coefficients by joint, whose sum with the joints equals ``offset``.
+        ``joints = {left = 0.29, right = -0.29, waist = 1.0}``
     offset : rad, m
-        Value of a where b is 0.
+        The constant of the relation. Default: 0.
         ``offset = 0.1``
     """
 
-    joint: Name
-    other: Name
-    ratio: float
+    name: Name | None = None
+    joint: Name | None = None
+    other: Name | None = None
+    ratio: float | None = None
+    polynomial: list[float] = []
+    table: list[tuple[float, float]] = []
+    joints: dict[str, float] = {}
     offset: float = 0.0
 
 
@@ -347,7 +373,7 @@ class MechanismSpec(FileStruct, frozen=True):
         Loop closures.
         ``loop = [{name = "elbow", type = "point_2d", frame_a = "left", frame_b = "right"}]``
     coupling
-        Gears between two joints.
+        Gears and other relations between joints.
         ``coupling = [{joint = "wheel", other = "pinion", ratio = -0.5}]``
     spring
         Springs and dampers.

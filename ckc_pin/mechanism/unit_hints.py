@@ -8,6 +8,7 @@ from statistics import median
 
 import numpy as np
 
+from ckc_pin.mechanism.couplings import coupled_joints
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Value, values_of
 
@@ -114,8 +115,8 @@ def _find_degrees(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator
         if spring.joint in angles and spring.rest is not None and looks_like_degrees(spring.rest):
             yield f"spring.{k}.rest = {spring.rest:g} rad"
     for coupling in spec.coupling:
-        if {coupling.joint, coupling.other} <= angles and looks_like_degrees(coupling.offset):
-            yield f"offset of the coupling of {coupling.joint} = {coupling.offset:g} rad"
+        if set(coupled_joints(coupling)) <= angles and looks_like_degrees(coupling.offset):
+            yield f"offset of the coupling of {coupled_joints(coupling)[0]} = {coupling.offset:g} rad"
     rotations = [(name, x) for name, x in values.items() if name.endswith(".rpy")]
     rotations += [(f"tree {tree_.file}, rpy", tree_.rpy) for tree_ in spec.tree]
     for name, rotation in rotations:

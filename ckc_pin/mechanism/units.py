@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ckc_pin.mechanism.couplings import coupled_joints, find_coupling
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import split_component, split_name
 
@@ -61,8 +62,9 @@ def _of_coordinate(mechanism: Mechanism, root: str, carrier: str, key: str) -> s
     """Return the unit of a parameter that depends on the unit of a coordinate."""
     spec, units = mechanism.spec, dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
     if root == "coupling":
-        coupling = spec.coupling[int(carrier)]
-        a, b = units[coupling.joint], units[coupling.other]
+        coupling = spec.coupling[find_coupling(spec, carrier)]
+        first, last = coupled_joints(coupling)[0], coupled_joints(coupling)[-1]
+        a, b = units[first], units[key.removeprefix("joints.") if key.startswith("joints.") else last]
         return a if key == "offset" else "" if a == b else f"{a}/{b}"
     if root == "spring":
         joint = spec.spring[int(carrier)].joint

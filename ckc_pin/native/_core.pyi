@@ -257,7 +257,7 @@ class ParameterDerivativeKind(enum.Enum):
 
     OFFSET = 16
 
-    RATIO = 17
+    COEFFICIENT = 17
 
     GAIN_Q = 18
 

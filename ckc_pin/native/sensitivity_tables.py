@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.arguments import present, values
+from ckc_pin.mechanism.couplings import coupled_joints
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.spec import FrameSpec
@@ -102,7 +103,7 @@ class ParameterDerivative:
         """Whether the constraint function depends on the parameter."""
         if self.placement is not None:
             return self.placement.placed != "spring"
-        return self.kind in ("length", "offset", "ratio")
+        return self.kind in ("length", "offset", "coefficient")
 
 
 @dataclass(frozen=True)
@@ -233,6 +234,7 @@ def sensitivity_table(
     armature = np.zeros(model.nv)
     armature[real_v] = tree.model.armature
     model.armature = armature
+    closure["curve"] = [[row, int(real_v[k])] for row, k in closure["curve"]]
     closure["affine_matrix"] = _scatter_columns(closure["affine_matrix"], real_v, model.nv)
     for key in ("joint_stiffness", "joint_rest", "joint_damping", "constant"):
         springs[key] = _scatter_columns(springs[key], real_v, model.nv)
@@ -289,7 +291,7 @@ def separate_parts(mechanism: Mechanism) -> list[int]:
         if spring.joint is None:
             connect(carrier(spring.frame_a), carrier(spring.frame_b))
     for coupling in spec.coupling:
-        connect(model.getJointId(coupling.joint), model.getJointId(coupling.other))
+        connect(*(model.getJointId(joint) for joint in coupled_joints(coupling)))
     number = {first_joint: k for k, first_joint in enumerate(dict.fromkeys(part[1:]))}
     by_coordinate = [0] * model.nv
     for joint in range(1, model.njoints):

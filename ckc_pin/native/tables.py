@@ -12,7 +12,7 @@ from ckc_pin.codegen.library import Library
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import RANK_TOLERANCE, jacobian_scales
-from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog
 from ckc_pin.mechanism.springs import Springs
 
 __all__ = ["closure_table", "core_table", "packed"]
@@ -59,9 +59,10 @@ def packed(model: Any) -> bytes:
 def closure_table(closure: Closure, n: int) -> dict[str, Any]:
     """Return the constraint rows of a closure by kind."""
     anchors = closure.anchors
-    table: dict[str, Any] = {name: [] for name in ("component", "dot", "distance", "affine", "log")}
+    table: dict[str, Any] = {name: [] for name in ("component", "dot", "distance", "affine", "curve", "log")}
     numbers: dict[str, list[Array]] = {"length": [np.zeros(0)], "affine_matrix": [np.zeros((0, n))],
         "affine_offset": [np.zeros(0)], "rotation_a": [np.zeros((0, 9))], "rotation_b": [np.zeros((0, 9))]}  # fmt: skip
+    curves = [np.zeros((0, 0))] * 3
     for group in closure.groups:
         out = group.out.tolist()
         match group:
@@ -76,6 +77,9 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
                 table["affine"] += out
                 numbers["affine_matrix"].append(_matrix(group.matrix, n))
                 numbers["affine_offset"].append(group.offset)
+                if isinstance(group, Curved):
+                    table["curve"] += _rows(out, group.coordinate)
+                    curves = [group.breaks, group.origins, group.coefficients.reshape(len(out), -1)]
             case RelativeLog():
                 table["log"] += _rows(out[::3], out[1::3], out[2::3], group.joint_a, group.joint_b)
                 numbers["rotation_a"].append(_matrix(group.rotation_a.reshape(-1, 9), 9))
@@ -85,6 +89,7 @@ def closure_table(closure: Closure, n: int) -> dict[str, Any]:
     return {
         **table,
         **{name: np.concatenate(parts) for name, parts in numbers.items()},
+        **dict(zip(("curve_breaks", "curve_origins", "curve_coefficients"), curves, strict=True)),
         "rows": closure.rows,
         "point_joint": anchors.point_joint.tolist(),
         "point_local": _matrix(anchors.point_local, 3),

@@ -126,8 +126,9 @@ def _entries(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     for key in BY_INDEX:
         yield from (ParameterDerivative(key, int(k), np.ones(1)) for k in np.flatnonzero(slopes.get(key, ())))
     yield from (ParameterDerivative("offset", int(k)) for k in np.flatnonzero(slopes.get("affine_offset", ())))
-    for row, coordinate in np.argwhere(slopes.get("affine", np.zeros((0, 0)))):
-        yield ParameterDerivative("ratio", int(row), np.array([coordinate], dtype=float))
+    coefficients = slopes.get("affine", np.zeros((0, 0)))
+    for row, k in np.argwhere(coefficients):
+        yield ParameterDerivative("coefficient", int(row), np.array([k, coefficients[row, k]], dtype=float))
     for k in np.flatnonzero(slopes.get("armature", ())):
         yield ParameterDerivative("armature", int(k), slopes["armature"][k : k + 1])
 

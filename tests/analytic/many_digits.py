@@ -13,7 +13,7 @@ import mpmath as mp
 import numpy as np
 
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.rows import Affine, Component, Distance, Dot, RelativeLog
+from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog
 
 mp.mp.dps = 80
 DERIVATIVE_STEP = mp.mpf(10) ** -20  # of differences of placements
@@ -156,6 +156,11 @@ class ManyDigits:
                     if not free:
                         x[at] = value
                 result[group.out] = exact(group.matrix) @ x - exact(group.offset)
+                for row, k in enumerate(group.coordinate) if isinstance(group, Curved) else ():
+                    piece = int(sum(x[k] >= group.breaks[row]))
+                    s = x[k] - mp.mpf(float(group.origins[row, piece]))
+                    powers = [mp.mpf(float(c)) for c in group.coefficients[row, piece]]
+                    result[group.out[row]] -= sum(c * s**i for i, c in enumerate(powers))
             elif isinstance(group, RelativeLog):
                 ends = zip(group.joint_a, group.rotation_a, group.joint_b, group.rotation_b, strict=True)
                 result[group.out] = np.concatenate(

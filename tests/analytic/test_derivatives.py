@@ -53,6 +53,15 @@ def test_every_kind_of_loop(kind: LoopType) -> None:
     assert_derivatives_agree(random_state(world.mechanism, np.random.default_rng(2), 0.05), np.random.default_rng(3))
 
 
+def test_nonlinear_couplings() -> None:
+    """Three joints in one coupling, a polynomial and a table; with compiled terms too."""
+    world = next(x for seed in range(20) if (x := closed_mechanism("point_2d", seed, nonlinear=True)).regular)
+    state, random = world.random_state(), np.random.default_rng(1)
+    assert_derivatives_agree(state, random)
+    assert_derivatives_agree(state, random, Plant(world.mechanism, library=compile_terms(world.mechanism)))
+    assert_derivatives_agree(random_state(world.mechanism, np.random.default_rng(2), 0.05), np.random.default_rng(3))
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_five_bar(seed: int) -> None:
     mechanism, random = load("five_bar"), np.random.default_rng(seed)

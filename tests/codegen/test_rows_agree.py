@@ -15,14 +15,18 @@ from tests.property.strategies import TYPES
 
 STATES = 5
 TOLERANCE = 1e-12  # relative to 1 + the largest entry
-ROW_TYPES = {rows.Component, rows.Dot, rows.Distance, rows.Affine, rows.RelativeLog}
+ROW_TYPES = {rows.Component, rows.Curved, rows.Dot, rows.Distance, rows.Affine, rows.RelativeLog}
 # Loops whose rows are resolved in the world's axes have components along directions that do not turn.
-CASES: list[tuple[LoopType, RowsIn]] = [*((kind, "a") for kind in TYPES), ("point", "world"), ("weld", "world")]
+CASES: list[tuple[LoopType, RowsIn, bool]] = [
+    *((kind, "a", False) for kind in TYPES), ("point", "world", False), ("weld", "world", False),
+    ("point_2d", "a", True),
+]  # fmt: skip
 
 
-def row_types(kind: LoopType, rows_in: RowsIn) -> set[type]:
-    """Return the types of a random mechanism's rows: a loop's and a coupling's."""
-    return {type(group) for group in closed_mechanism(kind, 1, rows_in=rows_in).mechanism.closure.groups}
+def row_types(kind: LoopType, rows_in: RowsIn, nonlinear: bool) -> set[type]:
+    """Return the types of a random mechanism's rows: a loop's and those of couplings."""
+    mechanism = closed_mechanism(kind, 1, rows_in=rows_in, nonlinear=nonlinear).mechanism
+    return {type(group) for group in mechanism.closure.groups}
 
 
 def test_the_cases_have_all_types_of_rows() -> None:
@@ -30,10 +34,10 @@ def test_the_cases_have_all_types_of_rows() -> None:
     assert set.union(*(row_types(*case) for case in CASES)) == ROW_TYPES
 
 
-@pytest.mark.parametrize(("kind", "rows_in"), CASES)
-def test_three_implementations_agree(kind: LoopType, rows_in: RowsIn) -> None:
+@pytest.mark.parametrize(("kind", "rows_in", "nonlinear"), CASES)
+def test_three_implementations_agree(kind: LoopType, rows_in: RowsIn, nonlinear: bool) -> None:
     """phi, J and J_dot v near the manifold and far from it, with a free root."""
-    mechanism = closed_mechanism(kind, 1, rows_in=rows_in).mechanism
+    mechanism = closed_mechanism(kind, 1, rows_in=rows_in, nonlinear=nonlinear).mechanism
     core, functions, random = _core.Core(core_table(mechanism)), symbolic(mechanism), np.random.default_rng(2)
     for spread in np.geomspace(1e-3, 1.0, STATES):
         q = mechanism.tree.integrate(mechanism.q_tree, spread * random.uniform(-1, 1, mechanism.n))

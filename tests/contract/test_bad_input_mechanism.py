@@ -38,6 +38,10 @@ def _named(what: str, content: str, *says: str) -> Bad:
     return _file(what, f'name = "o"\n{content}\n', *says)
 
 
+def _coupling(more: str = "") -> str:
+    return f'[[coupling]]\njoint = "theta_1"\nother = "theta_3"\n{more}'
+
+
 FILES = [
     _file("malformed", "name = \n", f"{NAMED}malformed TOML", "line 1"),
     _file("empty", "", f"{NAMED}the key 'name' is missing"),
@@ -100,7 +104,21 @@ LOOPS = [
     ),
     _add("coupling of nothing", '[[coupling]]\njoint = "theta_1"\nother = "x"\nratio = 1.0', "'x'", COORDINATES),
     _add("coupling to itself", '[[coupling]]\njoint = "theta_1"\nother = "theta_1"\nratio = 1.0', "to itself"),
-    _add("coupling without ratio", '[[coupling]]\njoint = "theta_1"\nother = "theta_3"', "'ratio' is missing"),
+    _add("coupling without ratio", _coupling(), "coupling 'theta_1~theta_3': give one of ratio, polynomial and table"),
+    _add("coupling with two curves", _coupling("ratio = 1.0\npolynomial = [0.0, 1.0]"), "got ratio and polynomial"),
+    _add("coupling of one joint", '[[coupling]]\njoint = "theta_1"\nratio = 1.0', "give joint and other, or joints"),
+    _add("coupling of two forms", _coupling("joints = {theta_1 = 1.0}"), "give either joints, or joint and other"),
+    _add(
+        "coupling of zeros", "[[coupling]]\njoints = {theta_1 = 0.0}", "coupling 'theta_1': all coefficients are zero"
+    ),
+    _add("coupling of unknowns", "[[coupling]]\njoints = {x = 1.0}", "'x'", COORDINATES),
+    _add("a table that turns back", _coupling("table = [[0, 0], [2, 1], [1, 2]]"), "but 1 follows 2"),
+    _add("a table of two points", _coupling("table = [[0, 0], [2, 1]]"), "expected 3 to 500 points, got 2"),
+    _add("a table that is no table", _coupling("table = [[0, 0, 1]]"), "expected a list of 2, got a list of 3"),
+    _add("a polynomial of infinities", _coupling("polynomial = [0.0, inf]"), FINITE),
+    _add(
+        "couplings of one name", 2 * (_coupling('name = "g"\nratio = 1.0') + "\n"), "two couplings have the same name"
+    ),
     _add("spring on nothing", "[[spring]]\nstiffness = 1.0", "spring 1: give either joint, or frame_a and frame_b"),
     _add("spring on an unknown joint", '[[spring]]\njoint = "x"\nstiffness = 1.0', "'x'", COORDINATES),
     _add(

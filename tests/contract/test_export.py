@@ -342,6 +342,46 @@ loop = [{{name = "hold", type = "{kind}", frame_a = "world", frame_b = "b", axis
         export(mechanism, "mjcf")
 
 
+def test_couplings_have_the_residuals_and_jacobians_of_mujoco() -> None:
+    """A gear, the sum of three joints, and a polynomial of the fourth degree, away from the assembled configuration."""
+    couplings: list[dict[str, Any]] = [
+        {"joint": "a", "other": "b", "ratio": -2.5, "offset": 0.3},
+        {"name": "sum", "joints": {"a": 2.0, "c": -0.7, "d": 0.3}, "offset": 0.4},
+        {"joint": "d", "other": "c", "polynomial": [0.1, 1.0, -0.3, 0.2, 0.05], "offset": -0.2},
+        {"joints": {"e": 2.0}, "offset": 0.3},
+    ]
+    parts = "".join(LINK.format(f"{x}1", 1) + MOVES.format(x, "continuous", "base", f"{x}1", "0 0 0", "0 0 0", "0 1 0")
+                    for x in "abcde")  # fmt: skip
+    mechanism = Mechanism.from_urdf(f'<robot name="r"><link name="base"/>{parts}</robot>', couplings=couplings)
+    mujoco_model = MujocoModel(mechanism)
+    scale = np.array([1.0, 1.0, 1.0, 2.0])  # MuJoCo's joint equality has the coefficient 1
+    for q_tree, v_tree in states(mechanism):
+        to = mujoco_model.put(q_tree, v_tree)
+        rows = mujoco_model.data.efc_J.reshape(-1, mujoco_model.model.nv)[: mujoco_model.data.ne] @ to
+        at = mechanism.kinematics(q_tree)
+        assert_same(scale * mujoco_model.data.efc_pos[: mujoco_model.data.ne], at.phi, EXACT)
+        assert_same(scale[:, None] * rows, at.J, EXACT)
+
+
+@pytest.mark.parametrize(
+    ("curve", "says"),
+    [
+        ({"polynomial": [0.0, 1.0, 0.0, 0.0, 0.0, 0.2]}, "a polynomial of degree 5"),
+        ({"table": [[-1.0, 0.0], [0.0, 0.1], [1.0, 0.5]]}, "a table"),
+    ],
+)
+def test_curves_without_equality_constraint_are_refused(curve: dict[str, Any], says: str) -> None:
+    mechanism = Mechanism.from_urdf(
+        f'<robot name="r"><link name="base"/>{LINK.format("x", 1)}{LINK.format("y", 1)}'
+        + MOVES.format("a", "continuous", "base", "x", "0 0 0", "0 0 0", "0 1 0")
+        + MOVES.format("b", "continuous", "base", "y", "0 0 0", "0 0 0", "0 1 0")
+        + "</robot>",
+        couplings=[{"joint": "a", "other": "b", **curve}],
+    )
+    with pytest.raises(InputError, match=f"coupling 'a~b': MuJoCo has no equality constraint for {says}"):
+        export(mechanism, "mjcf")
+
+
 def test_unknown_format_is_refused() -> None:
     refused = ckc("export", "five_bar", "--to", "sdf")
     assert refused.code == 2

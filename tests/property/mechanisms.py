@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from ckc_pin.base.sources import Sources
 from ckc_pin.dynamics import Terms
@@ -87,6 +88,7 @@ def closed_mechanism(
     redundant: bool = False,
     turn: Array | None = None,
     rows_in: RowsIn = "a",
+    nonlinear: bool = False,
 ) -> Closed:
     """Return a mechanism with a loop between the links a_3 and b_3, a coupling, springs, dampers and rotors.
 
@@ -100,6 +102,8 @@ def closed_mechanism(
         Rotation of everything, gravity included, about the world's origin.
     rows_in
         Axes in which the loop's rows are resolved: frame A's or the world's.
+    nonlinear
+        Couple joints by a polynomial, by a table, and three joints at once, instead of two by a gear.
     """
     world = random_world(seed, free=free)
     q = world.configuration()
@@ -117,12 +121,29 @@ def closed_mechanism(
         gravity=_triple(turn @ world.gravity),
         q_guess=q,
         loop=[loop, *(duplicate if redundant else [])],
-        coupling=[CouplingSpec(joint="a_j1", other="b_j4", ratio=0.7, offset=q["a_j1"] - 0.7 * q["b_j4"])],
+        coupling=nonlinear_couplings(q)
+        if nonlinear
+        else [CouplingSpec(joint="a_j1", other="b_j4", ratio=0.7, offset=q["a_j1"] - 0.7 * q["b_j4"])],
         spring=SPRINGS,
         joint=ROTORS,
     )
     texts = {prefix: world.urdf(prefix) for prefix in world.stands}
     return Closed(assemble_mechanism(spec, Sources("a random world", None, texts)), world, q)
+
+
+def nonlinear_couplings(q: Numbers) -> list[CouplingSpec]:
+    """Return couplings of three joints, by a polynomial, and by a table of a sine, which hold at q."""
+    sums = {"a_j3": 0.3, "b_j2": -0.5, "b_j3": 1.2}
+    powers = [0.1, 0.8, -0.3, 0.2, -0.05, 0.01]
+    at, x = q["b_j4"], np.linspace(-3.2, 3.2, 15)
+    table = [(float(a), float(np.sin(a))) for a in x]
+    return [
+        CouplingSpec(joints=sums, offset=sum(c * q[name] for name, c in sums.items())),
+        CouplingSpec(joint="a_j1", other="b_j4", polynomial=powers,
+                     offset=q["a_j1"] - float(np.polynomial.polynomial.polyval(at, powers))),
+        CouplingSpec(joint="a_j4", other="b_j1", table=table,
+                     offset=q["a_j4"] - float(make_interp_spline(x, np.sin(x), 5)(q["b_j1"]))),
+    ]  # fmt: skip
 
 
 def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> LoopSpec:

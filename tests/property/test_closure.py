@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from ckc_pin.mechanism.closure import ClosureBuilder
@@ -145,6 +146,42 @@ def test_a_coupling_is_affine(seed: int, ratio: float, offset: float, prismatic:
     assert_close(at.phi, [q[joint] - ratio * q[other] - offset], 1e-14)
     assert_close(at.J @ closed.vector(v), [v[joint] - ratio * v[other]], 1e-13)
     assert_close(at.J_dot(closed.vector(v)), 0, 0)
+
+
+@given(seed=seeds)
+def test_nonlinear_couplings(seed: int) -> None:
+    """Sums of joints, a polynomial, and SciPy's quintic spline, with the second derivative of its ends beyond them."""
+    world = random_world(seed)
+    q, v = world.configuration(), world.velocity()
+    x = np.array([-1.0, -0.6, -0.3, 0.1, 0.4, 0.7, 1.1, 1.5])
+    spline = make_interp_spline(x, np.exp(x), 5)
+
+    def curve(at: float) -> float:
+        end = float(np.clip(at, x[0], x[-1]))
+        return float(spline(end) + spline(end, 1) * (at - end) + spline(end, 2) * (at - end) ** 2 / 2)
+
+    specs = [
+        CouplingSpec(joints={"a_j1": 0.5, "b_j4": -2.0, "b_j3": 0.25}, offset=0.3),
+        CouplingSpec(joint="a_j4", other="b_j1", polynomial=[1.0, -0.5, 0.0, 2.0], offset=-0.2),
+        CouplingSpec(joint="a_j3", other="b_j3", table=list(zip(x.tolist(), np.exp(x).tolist(), strict=True))),
+    ]
+    closed = Closed(world, *specs)
+
+    def phi(q: Numbers) -> Array:
+        b = q["b_j1"]
+        return np.array(
+            [
+                0.5 * q["a_j1"] - 2.0 * q["b_j4"] + 0.25 * q["b_j3"] - 0.3,
+                q["a_j4"] - (1.0 - 0.5 * b + 2.0 * b**3) + 0.2,
+                q["a_j3"] - curve(q["b_j3"]),
+            ]
+        )
+
+    at = closed.at(q)
+    assert_close(at.phi, phi(q), 1e-12)
+    assert_close(at.J @ closed.vector(v), slope(lambda t: phi(world.moved(q, v, t))), 1e-9)
+    J_dot = slope(lambda t: closed.at(world.moved(q, v, t)).J)
+    assert_close(at.J_dot(closed.vector(v)), J_dot, 1e-9)
 
 
 @given(seed=seeds, data=st.data())

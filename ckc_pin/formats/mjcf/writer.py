@@ -11,13 +11,14 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.couplings import coefficients_of, coupling_name
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rows import Affine
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
 __all__ = ["DEFAULT_TIME_STEP_S", "place_in_plane", "to_mjcf"]
@@ -30,6 +31,7 @@ TRIANGLE_TOLERANCE = 1e-9  # relative; of the triangle inequality between princi
 STICK_RADIUS = 0.03  # of the mechanism's size
 MIN_STICK_LENGTH = 1e-6  # of the mechanism's size
 PLANE_TOLERANCE = 1e-9  # of the mechanism's size; how far a planar loop may leave its plane
+MAX_POWERS = 5  # coefficients of the polynomial of a joint equality
 PLANE_CONFIGURATIONS = 5  # random ones, at which this is checked
 
 
@@ -72,9 +74,9 @@ def to_mjcf(mechanism: Mechanism, time_step: float = DEFAULT_TIME_STEP_S) -> tup
     return tostring(root, encoding="unicode") + "\n", differences
 
 
-def _format(values: Array | float) -> str:
+def _format(values: ArrayLike) -> str:
     """Return numbers as text that is read back to the same doubles."""
-    return " ".join(repr(float(x)) for x in np.atleast_1d(values))
+    return " ".join(repr(float(x)) for x in np.atleast_1d(np.asarray(values)))
 
 
 def _quaternion(rotation: Array) -> Array:
@@ -285,7 +287,7 @@ def _add_loops(mechanism: Mechanism, root: Element, sites: _Sites) -> list[str]:
                 f"{mechanism.name}: loop {loop.name!r}: MuJoCo has no equality constraint for type {loop.type!r}; "
                 "supported are point, point_2d in a plane, hinge, weld and distance"
             )
-    _add_couplings(mechanism, equality)
+    _add_couplings(mechanism, equality, tendon)
     root.extend(section for section in (tendon, equality) if len(section))
     return notes
 
@@ -367,14 +369,36 @@ def _add_distance(
     SubElement(equality, "tendon", name=loop.name, tendon1=loop.name, polycoef=polynomial)
 
 
-def _add_couplings(mechanism: Mechanism, equality: Element) -> None:
-    """Add the rows joint - ratio * other - offset = 0 of couplings and of a URDF's mimic joints."""
-    names = [name for name, row in mechanism.closure.names if row == "coupling"]
-    affine = [group for group in mechanism.closure.groups if isinstance(group, Affine)]
-    rows = [row for group in affine for row in zip(group.matrix, group.offset, strict=True)]
-    for name, (row, offset) in zip(names, rows, strict=True):
-        joint = int(np.flatnonzero(row == 1)[0])
-        others = [int(k) for k in np.flatnonzero(row) if k != joint]
-        joints = {f"joint{k + 1}": mechanism.coordinates[at] for k, at in enumerate([joint, *others])}
-        polynomial = [offset, -sum(row[others]), 0, 0, 0]
-        SubElement(equality, "joint", {"name": name} | joints, polycoef=_format(np.array(polynomial)))
+def _add_couplings(mechanism: Mechanism, equality: Element, tendon: Element) -> None:
+    """Add couplings and a URDF's mimic joints: a polynomial of one joint, or a tendon of constant length.
+
+    Raises
+    ------
+    InputError
+        MuJoCo has no equality constraint for the curve of a coupling.
+    """
+    for coupling in mechanism.couplings:
+        name, polynomial, coefficients = coupling_name(coupling), coupling.polynomial, coefficients_of(coupling)
+        if coupling.table or len(polynomial) > MAX_POWERS:
+            curve = "a table" if coupling.table else f"a polynomial of degree {len(polynomial) - 1}"
+            raise InputError(
+                f"{mechanism.name}: coupling {name!r}: MuJoCo has no equality constraint for {curve}; "
+                f"polynomials up to degree {MAX_POWERS - 1} are supported"
+            )
+        joints = [joint for joint, coefficient in coefficients.items() if coefficient]
+        if len(joints) > 2:
+            fixed = SubElement(tendon, "fixed", name=name)
+            for joint in joints:
+                SubElement(fixed, "joint", joint=joint, coef=_format(coefficients[joint]))
+            SubElement(equality, "tendon", name=name, tendon1=name, polycoef=_format([coupling.offset, 0, 0, 0, 0]))
+            continue
+        if polynomial:
+            joints.append(str(coupling.other))
+        else:
+            first = coefficients[joints[0]]
+            polynomial = [0.0, *(-coefficients[joint] / first for joint in joints[1:])]
+        powers = np.zeros(MAX_POWERS)
+        powers[: len(polynomial)] = polynomial
+        powers[0] += coupling.offset / coefficients[joints[0]]
+        names = {f"joint{k + 1}": joint for k, joint in enumerate(joints)}
+        SubElement(equality, "joint", {"name": name} | names, polycoef=_format(powers))

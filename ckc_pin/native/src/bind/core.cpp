@@ -60,6 +60,14 @@ Closure closure_from_table(const nb::dict& table) {
     const auto k = static_cast<Eigen::Index>(c.affine.size());
     c.affine.push_back({out, matrix.row(k).transpose(), offsets(k)});
   }
+  const auto breaks = get<Matrix>(table, "curve_breaks"), origins = get<Matrix>(table, "curve_origins"),
+             polynomials = get<Matrix>(table, "curve_coefficients");
+  for (const auto& row : get<std::vector<Indices>>(table, "curve")) {
+    const auto k = static_cast<Eigen::Index>(c.curves.size());
+    const Vector flat = polynomials.row(k).transpose();  // the coefficients of one piece after those of the other
+    c.curves.push_back({row[0], row[1], breaks.row(k).transpose(), origins.row(k).transpose(),
+                        flat.reshaped(flat.size() / origins.cols(), origins.cols())});
+  }
   const auto a = get<Matrix>(table, "rotation_a"), b = get<Matrix>(table, "rotation_b");
   for (const auto& row : get<std::vector<Indices>>(table, "log")) {
     const auto k = static_cast<Eigen::Index>(c.logs.size());

@@ -93,7 +93,7 @@ void bind_enums(nb::module_& m) {
       .value("ARMATURE", Kind::armature)
       .value("LENGTH", Kind::length)
       .value("OFFSET", Kind::offset)
-      .value("RATIO", Kind::ratio)
+      .value("COEFFICIENT", Kind::coefficient)
       .value("GAIN_Q", Kind::gain_q)
       .value("GAIN_Q_DOT", Kind::gain_q_dot)
       .value("TARGET", Kind::target)

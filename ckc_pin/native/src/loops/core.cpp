@@ -224,7 +224,7 @@ void Core::update_row_rates() {
   if (is_valid(row_rates)) return;
   update_tree();
   bias_without_springs_ = tree.compute_bias(q_tree, v_tree);
-  constraints.update_rates(tree);
+  constraints.update_rates(tree, v_tree);
   valid_parts_ |= row_rates;
 }
 

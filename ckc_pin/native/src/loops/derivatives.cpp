@@ -50,6 +50,7 @@ void DynamicsDerivatives::compute(In q, In v, In a, In lambda, bool impulsive) {
   for (const auto& row : closure_.distances) add_distance(row, lambda(row.out));
   for (const auto& rows : closure_.logs) add_log(rows, lambda);
   for (const auto& row : closure_.affine) J.row(row.out) = row.coefficients;
+  for (const auto& row : closure_.curves) add_curve(row, q, v, a, lambda(row.out));
   if (!impulsive) add_springs();
 }
 
@@ -109,6 +110,16 @@ void DynamicsDerivatives::add_distance(const Distance& row, double lambda) {
   add_row(row.out, a, r, r_dot, r_ddot), add_row(row.out, b, -r, -r_dot, -r_ddot);
   add_curvature(a, lambda * r), add_curvature(b, -lambda * r);
   add_product(a, a, weight), add_product(b, b, weight), add_product(a, b, -weight), add_product(b, a, -weight);
+}
+
+void DynamicsDerivatives::add_curve(const Curve& row, In q, In v, In a, double lambda) {
+  const int k = row.coordinate;
+  const Vector4 p = row.evaluate(q(tree_.q_index[k]));
+  J(row.out, k) -= p(1);
+  rate_by_q(row.out, k) -= p(2) * v(k);
+  row_by_q(row.out, k) -= p(2) * a(k) + p(3) * v(k) * v(k);
+  row_by_v(row.out, k) -= 2 * p(2) * v(k);
+  force_by_q(k, k) += lambda * p(2);
 }
 
 // u = log(R_A^T R_B), u_dot = Jlog(u) R_B^T (omega_B - omega_A).

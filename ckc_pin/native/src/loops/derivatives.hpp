@@ -33,6 +33,7 @@ class DynamicsDerivatives {
   void add_component(const Component& row, double lambda);
   void add_dot(const Dot& row, double lambda);
   void add_distance(const Distance& row, double lambda);
+  void add_curve(const Curve& row, In q, In v, In a, double lambda);
   void add_log(const RelativeLog& rows, In lambda);
   void add_springs();
 

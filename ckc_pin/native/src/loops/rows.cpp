@@ -32,6 +32,17 @@ Vector6 torque(const Vector3& about) {
 
 }  // namespace
 
+Vector4 Curve::evaluate(double x) const {
+  const auto piece = std::upper_bound(breaks.begin(), breaks.end(), x) - breaks.begin();
+  x -= origins(piece);
+  Vector4 taylor = Vector4::Zero();
+  for (auto k = coefficients.rows() - 1; k >= 0; --k) {
+    for (int i = 3; i > 0; --i) taylor(i) = taylor(i) * x + taylor(i - 1);
+    taylor(0) = taylor(0) * x + coefficients(k, piece);
+  }
+  return taylor.cwiseProduct(Vector4(1.0, 1.0, 2.0, 6.0));
+}
+
 ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::move(table)) {
   const Closure& c = closure;
   pair_count_ = static_cast<int>(c.point_joint.size()) / 2;
@@ -54,6 +65,7 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   used.erase(0);  // the world does not move
   joints_.assign(used.begin(), used.end());
   phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
+  curve_values_.assign(c.curves.size(), Vector4::Zero()), curve_rates_.setZero(c.curves.size());
   for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
   for (int i = 0; i < c.rows; ++i) {
     std::set<int> columns;
@@ -63,6 +75,8 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
     }
     for (int j = 0; j < tree.n; ++j)
       if (J(i, j) != 0.0) columns.insert(j);
+    for (const auto& curve : c.curves)
+      if (curve.out == i) columns.insert(curve.coordinate);
     pattern[i].assign(columns.begin(), columns.end());
   }
 }
@@ -112,6 +126,11 @@ void ConstraintRows::update(const Tree& tree, In q) {
     for (int j : pattern[row.out]) value += row.coefficients(j) * q(tree.q_index[j]);
     phi(row.out) = value;
   }
+  for (size_t k = 0; k < c.curves.size(); ++k) {
+    const Curve& curve = c.curves[k];
+    curve_values_[k] = curve.evaluate(q(tree.q_index[curve.coordinate]));
+    phi(curve.out) -= curve_values_[k](0);
+  }
   update_relative_rotations(tree);
 }
 
@@ -130,8 +149,9 @@ void ConstraintRows::update_relative_rotations(const Tree& tree) {
   }
 }
 
-void ConstraintRows::update_rates(const Tree& tree) {
+void ConstraintRows::update_rates(const Tree& tree, In v) {
   const Closure& c = closure;
+  for (size_t k = 0; k < c.curves.size(); ++k) curve_rates_(static_cast<Eigen::Index>(k)) = v(c.curves[k].coordinate);
   for (int joint : joints_)
     velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.bias_acceleration(joint);
   for (size_t k = 0; k < p_.size(); ++k) {
@@ -185,11 +205,13 @@ void ConstraintRows::update_relative_rotation_rates(const Tree& tree) {
 void ConstraintRows::update_jacobian(const Tree& tree) {
   const Matrix6x& columns = tree.jacobian();
   for (int i = 0; i < closure.rows; ++i) {
-    if (wrenches_[i].empty()) continue;  // affine rows have a constant Jacobian
+    if (wrenches_[i].empty()) continue;  // the Jacobian of an affine row is constant, except for its curve
     for (int j : pattern[i]) J(i, j) = 0.0;
     for (const auto& wrench : wrenches_[i])
       for (int j : tree.support[wrench.joint]) J(i, j) += wrench.w.dot(columns.col(j));
   }
+  for (size_t k = 0; k < closure.curves.size(); ++k)
+    J(closure.curves[k].out, closure.curves[k].coordinate) = -curve_values_[k](1);
 }
 
 void ConstraintRows::update_jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
@@ -200,6 +222,9 @@ void ConstraintRows::update_jacobian_dot(const Tree& tree, const Matrix6x& colum
       for (int j : tree.support[wrench.joint])
         J_dot(i, j) += wrench.w.dot(columns_dot.col(j)) + wrench.w_dot.dot(columns.col(j));
   }
+  for (size_t k = 0; k < closure.curves.size(); ++k)
+    J_dot(closure.curves[k].out, closure.curves[k].coordinate) =
+        -curve_values_[k](2) * curve_rates_(static_cast<Eigen::Index>(k));
 }
 
 void ConstraintRows::bias(Out J_dot_v) const {
@@ -208,6 +233,10 @@ void ConstraintRows::bias(Out J_dot_v) const {
     for (const auto& wrench : wrenches_[i])
       if (wrench.joint) value += wrench.w.dot(acceleration_[wrench.joint]) + wrench.w_dot.dot(velocity_[wrench.joint]);
     J_dot_v(i) = value;
+  }
+  for (size_t k = 0; k < closure.curves.size(); ++k) {
+    const double rate = curve_rates_(static_cast<Eigen::Index>(k));
+    J_dot_v(closure.curves[k].out) -= curve_values_[k](2) * rate * rate;
   }
 }
 

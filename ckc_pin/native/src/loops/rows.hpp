@@ -25,6 +25,14 @@ struct Affine {  // coefficients . q' - offset
   Vector coefficients;  // (n)
   double offset;
 };
+// A piecewise polynomial p of one coordinate, which an affine row has in addition: coefficients . q' - offset - p.
+struct Curve {
+  int out, coordinate;
+  Vector breaks;        // (pieces - 1), ascending; padded with infinity
+  Vector origins;       // (pieces)
+  Matrix coefficients;  // (degree + 1, pieces): of the powers of x - origin
+  Vector4 evaluate(double x) const;  // p and its first three derivatives
+};
 struct RelativeLog {  // log(R_A^T R_B), three rows; R: rotation of the joint times a constant rotation
   int out[3];
   int joint_a, joint_b;
@@ -41,6 +49,7 @@ struct Closure {
   std::vector<Dot> dots;
   std::vector<Distance> distances;
   std::vector<Affine> affine;
+  std::vector<Curve> curves;
   std::vector<RelativeLog> logs;
 };
 
@@ -66,7 +75,8 @@ class ConstraintRows {
   std::vector<Indices> pattern_in(const Indices& columns, int n) const;
   void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
   void update_jacobian(const Tree& tree);
-  void update_rates(const Tree& tree);  // rates of the wrenches; requires the tree's velocities and accelerations
+  // Rates of the wrenches; requires the tree's velocities and accelerations at v.
+  void update_rates(const Tree& tree, In v);
   void update_jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
   void bias(Out J_dot_v) const;  // requires update_rates
 
@@ -75,6 +85,8 @@ class ConstraintRows {
   void update_relative_rotation_rates(const Tree& tree);
 
   int pair_count_;
+  std::vector<Vector4> curve_values_;             // by curve: p and its derivatives
+  Vector curve_rates_;                            // by curve: rate of its coordinate
   std::vector<Vector3> p_, r_, e_;                // points, vectors A - B of the pairs, directions; in world axes
   std::vector<Vector3> p_dot_, r_dot_, e_dot_;    // their rates
   Indices joints_;                                // joints that rows are attached to

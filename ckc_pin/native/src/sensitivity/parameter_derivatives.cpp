@@ -83,9 +83,9 @@ void Sensitivities::add_term_derivative(const ParameterDerivative& of, In a, In 
       break;
     case ParameterDerivative::inertia: add_inertia(of, impulsive, force); break;
     case ParameterDerivative::armature: force(k) += of.numbers(0) * a(k); break;
-    case ParameterDerivative::ratio: {
-      const int other = static_cast<int>(of.numbers(0));
-      force(other) += lambda(k), row(k) -= a(other);
+    case ParameterDerivative::coefficient: {
+      const int coordinate = static_cast<int>(of.numbers(0));
+      force(coordinate) -= of.numbers(1) * lambda(k), row(k) += of.numbers(1) * a(coordinate);
       break;
     }
     case ParameterDerivative::length:
@@ -194,10 +194,10 @@ void Sensitivities::closure_derivatives(In v, Matrix& phi_derivative, Matrix& ph
         phi_dot_derivative.col(p) += of.numbers(0) * derivatives_.rate_by_q.col(of.index);
       } else if (of.kind == ParameterDerivative::offset) {
         phi_derivative(of.index, p) -= 1.0;
-      } else if (of.kind == ParameterDerivative::ratio) {
-        const int other = static_cast<int>(of.numbers(0));
-        phi_derivative(of.index, p) -= core_.q_tree(core_.tree.q_index[other]),
-            phi_dot_derivative(of.index, p) -= v(other);
+      } else if (of.kind == ParameterDerivative::coefficient) {
+        const int coordinate = static_cast<int>(of.numbers(0));
+        phi_derivative(of.index, p) += of.numbers(1) * core_.q_tree(core_.tree.q_index[coordinate]),
+            phi_dot_derivative(of.index, p) += of.numbers(1) * v(coordinate);
       } else if (of.kind == ParameterDerivative::length) {
         for (const Distance& distance : table_.closure.distances)
           if (distance.out == of.index)

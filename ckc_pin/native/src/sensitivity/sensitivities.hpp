@@ -38,7 +38,7 @@ struct ParameterDerivative {
     // index: row of phi
     length,
     offset,
-    ratio,  // numbers: index of the other coordinate (1)
+    coefficient,  // of an affine row; numbers: index of the coordinate, and the derivative of its coefficient (2)
 
     gain_q,        // index: unused; numbers: K_P or Lambda, by columns
     gain_q_dot,    // index: unused; numbers: K_V or K_D, by columns

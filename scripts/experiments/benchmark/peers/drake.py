@@ -14,9 +14,9 @@ from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer import place_in_plane
+from ckc_pin.mechanism.couplings import coefficients_of, coupling_name, curve_of
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.rows import Affine
 from scripts.experiments.benchmark.peers.stepping import (
     CONTROLLED,
     dividing_step,
@@ -203,13 +203,15 @@ class _Plant:
             if loop.type == "hinge":  # a second point of the axis
                 ends = [_point_on_axis(a, loop.axis_a, mechanism.size), _point_on_axis(b, loop.axis_b, mechanism.size)]
                 plant.AddBallConstraint(first, ends[0], second, ends[1])
-        for group in mechanism.closure.groups:
-            for row, offset in zip(group.matrix, group.offset, strict=True) if isinstance(group, Affine) else ():
-                k = int(np.flatnonzero(row == 1)[0])
-                other = next((int(j) for j in np.flatnonzero(row) if j != k), None)
-                if other is None:
-                    raise InputError("a coupling with ratio 0 has no counterpart in it")
-                plant.AddCouplerConstraint(self._joints[k], self._joints[other], -row[other], offset)
+        for coupling in mechanism.couplings:
+            coefficients = {joint: x for joint, x in coefficients_of(coupling).items() if x}
+            if len(coefficients) != 2 or curve_of(coupling) is not None:
+                raise InputError(
+                    f"coupling {coupling_name(coupling)} has no counterpart in it: it has linear gears only"
+                )
+            (joint, first), (other, second) = coefficients.items()
+            ends = [self._joints[mechanism.tree.index[name]] for name in (joint, other)]
+            plant.AddCouplerConstraint(*ends, -second / first, coupling.offset / first)
 
     def _hold(self, stiffness: float) -> None:
         """Close the loops, which are all points, by bushings."""
