@@ -73,4 +73,8 @@ def find_in_repository(uri: str, model: Path, where: str, default: str = "") -> 
                 return path / default
             if path.is_file():
                 return path
+    for depth in ("*", "*/*") if scheme and rest and ".." not in rest else ():
+        for path in sorted(root.glob(f"{depth}/{rest}{f'/{default}' if default and not Path(rest).suffix else ''}")):
+            if path.is_file() and path.resolve().is_relative_to(root):
+                return path
     raise InputError(f"{where}: no such file in the model's repository {root.name!r}")
