@@ -139,32 +139,39 @@ def _share_folders() -> list[Path]:
 def parse_xml(text: str, source: str) -> ElementTree.Element:
     """Parse XML from an untrusted file: no error recovery, no document type, no entities, limited nesting.
 
+    Names keep their prefix, as in "drake:joint". Namespaces are not resolved, because robot files rarely declare them.
+
     Raises
     ------
     InputError
         The text is not valid XML (the message has the line), declares a document type, or is nested too deeply.
     """
     depth = 0
+    builder = ElementTree.TreeBuilder()
 
     def reject_doctype(name: str, *_: object) -> None:
         raise InputError(f"{source}: a document type declaration ({name}) is not accepted")
 
-    def count_start(*_: object) -> None:
+    def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth
         depth += 1
         if depth > MAX_XML_DEPTH:
             raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
+        builder.start(tag, attributes)
 
-    def count_end(_: str) -> None:
+    def end(tag: str) -> None:
         nonlocal depth
         depth -= 1
+        builder.end(tag)
 
     # The text was decoded as UTF-8, so an encoding named in its first line is ignored.
-    checker = expat.ParserCreate("utf-8")
-    checker.StartDoctypeDeclHandler = reject_doctype
-    checker.StartElementHandler, checker.EndElementHandler = count_start, count_end
+    parser = expat.ParserCreate("utf-8")
+    parser.buffer_text = True
+    parser.StartDoctypeDeclHandler = reject_doctype
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.CharacterDataHandler = builder.data
     try:
-        checker.Parse(text.encode(), True)
-        return ElementTree.fromstring(text.encode(), ElementTree.XMLParser(encoding="utf-8"))
-    except (expat.ExpatError, ElementTree.ParseError) as error:
+        parser.Parse(text.encode(), True)
+    except expat.ExpatError as error:
         raise InputError(f"{source}: malformed XML: {error}") from None
+    return builder.close()

@@ -65,19 +65,24 @@ def new(folder: Path, as_json: bool) -> None:
     "file",
     metavar="FILE",
     type=options.PATH,
-    help="An MJCF of MuJoCo, a URDF, or a robot.yaml next to its URDF.",
+    help="An MJCF of MuJoCo, an SDFormat file, a URDF, or a robot.yaml or loop_closures.yaml next to its URDF.",
+)
+@click.option(
+    "--repair",
+    is_flag=True,
+    help="Replace impossible inertias by the nearest possible ones, and exchange swapped limits.",
 )
 @options.out(help="Folder to write to; default: the robot's name.")
 @options.overwrite
 @options.as_json
-def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> None:
+def import_(file: Path, repair: bool, out: Path | None, overwrite: bool, as_json: bool) -> None:
     """Convert a robot from another format. Writes mechanism.toml and a URDF, and lists guesses and omissions."""
     from ckc_pin.formats import importing
 
     # MuJoCo imports GLFW for its windows. GLFW starts a Python process, which prints a traceback on Ctrl-C.
     os.environ.setdefault("MUJOCO_GL", "disable")
     with Spinner(f"reading {file.name}"):
-        draft = importing.read(file)
+        draft = importing.read(file, repair)
     with interrupts.deferred():  # both files or none
         paths = importing.write(draft, out or Path(draft.name), overwrite)
     result, problem = None, ""
@@ -86,11 +91,21 @@ def import_(file: Path, out: Path | None, overwrite: bool, as_json: bool) -> Non
     except ckc_pin.MechanismError as error:  # The files remain, so that the user can correct them.
         problem = str(error)
     if as_json:
-        notes = {"left_out": draft.left_out, "guessed": draft.guessed}
+        notes = {"warnings": draft.warnings, "left_out": draft.left_out, "guessed": draft.guessed}
         check = {"status": "done", **result.to_dict()} if result else {"status": "error", "message": problem}
-        print_json({"status": "done", "written": [str(path) for path in paths], **notes, "check": check})
+        print_json(
+            {
+                "status": "done",
+                "format": draft.origin,
+                "written": [str(path) for path in paths],
+                **notes,
+                "check": check,
+            }
+        )
         return
-    for label, items in (("written", paths), ("guessed", draft.guessed), ("left out", draft.left_out)):
+    print(f"read as: {draft.origin}")
+    lines = (("written", paths), ("warning", draft.warnings), ("guessed", draft.guessed), ("left out", draft.left_out))
+    for label, items in lines:
         for item in items:
             print(f"{label}: {item}")
     if result:

@@ -1,112 +1,42 @@
-"""An imported mechanism before it is written: a URDF tree, the loops beside it, and notes for the user.
-
-Every reader returns a `Draft`. The module also has what all readers share: names, rounding, rotations.
-"""
+"""An imported mechanism before it is written: ``mechanism.toml`` as tables, and its URDF."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TypeVar
 from xml.etree import ElementTree
 
-import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
-from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.errors import MechanismError
+from ckc_pin.formats.robot import Tables, WithComment
 from ckc_pin.kinematics.assembly import assemble_mechanism
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.spec import (
-    CouplingSpec,
-    ForceSpec,
-    Frame,
-    FrameSpec,
-    JointSpec,
-    LoopSpec,
-    MechanismSpec,
-    MotorSpec,
-    PointSpec,
-    SpringSpec,
-    Vector3,
-)
+from ckc_pin.mechanism.spec import JointSpec, MechanismSpec
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, UrdfTree, merge
 
-__all__ = [
-    "Draft",
-    "choose_independent",
-    "choose_name",
-    "from_axis_angle",
-    "from_quaternion",
-    "from_rpy",
-    "list_names",
-    "make_frame",
-    "make_unique",
-    "require_direction",
-    "round_number",
-    "round_vector",
-    "to_rpy",
-]
-
-T = TypeVar("T")
-WithComment = list[tuple[T, str]]  # each table with its comment in the file; an empty comment is not written
-
-GENERIC_NAMES = ("robot", "model", "scene", "main", "urdf", "mjcf")  # do not identify a mechanism
-MAX_NAME_CHARACTERS = 80
-MAX_LISTED_NAMES = 6  # in one message
-ZERO_TOLERANCE = 1e-15  # smaller lengths (m) and angles (rad) are rounding errors of a conversion
+__all__ = ["Draft", "choose_independent"]
 
 
-@dataclass
-class Draft:
-    """A mechanism as a reader understood it, to be written as ``mechanism.toml`` and a URDF.
+@dataclass(kw_only=True)
+class Draft(Tables):
+    """A mechanism with the files' content. `ckc_pin.formats.tree` makes it of a `Robot`.
 
     Attributes
     ----------
-    name : str
-        Name of the mechanism, and of its URDF.
-    origin : str
-        The file that was imported and its format. The first line of ``mechanism.toml`` quotes it.
+    source : str
+        Name of the imported file in messages.
     robot : Element
         The tree as a URDF's <robot>.
-    loops, couplings, springs, forces, joints, motors, points : list of (spec, comment)
-        Tables of ``mechanism.toml``.
-    independent, actuated : list of str or None
-        None: the program chooses them. `actuated` also lists the joints of `motors`.
-    why_independent : str
-        Comment on `independent`.
-    gravity : (3,) tuple
-        m/s^2.
-    q_guess : dict of str to float
-        Start of the assembly by coordinate, rad or m.
-    guessed : list of str
-        What the file does not say, and what was assumed.
-    left_out : list of str
-        Content of the file that the mechanism does not have.
+    joints : list of (JointSpec, comment)
+        Armatures and stops, which a URDF cannot express.
     """
 
-    name: str
-    origin: str
+    source: str
     robot: ElementTree.Element
-    loops: WithComment[LoopSpec] = field(default_factory=list)
-    couplings: WithComment[CouplingSpec] = field(default_factory=list)
-    springs: WithComment[SpringSpec] = field(default_factory=list)
-    forces: WithComment[ForceSpec] = field(default_factory=list)
     joints: WithComment[JointSpec] = field(default_factory=list)
-    motors: WithComment[MotorSpec] = field(default_factory=list)
-    points: WithComment[PointSpec] = field(default_factory=list)
-    independent: list[str] | None = None
-    actuated: list[str] | None = None
-    why_independent: str = ""
-    gravity: Vector3 = (0.0, 0.0, -9.81)
-    q_guess: dict[str, float] = field(default_factory=dict)
-    guessed: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
 
     @property
     def urdf_file(self) -> str:
@@ -144,13 +74,13 @@ class Draft:
         MechanismError
             Pinocchio cannot build the tree.
         """
-        text, urdf = merge([TreeText(self.urdf_text(), self.urdf_file)])
+        text, urdf = merge([TreeText(self.urdf_text(), self.source)])
         try:
             tree = Tree(pin.buildModelFromXML(text))
         except MechanismError as error:
-            raise MechanismError(f"{self.name}: {error}") from None
+            raise MechanismError(f"{self.source}: {error}") from None
         except (ValueError, RuntimeError) as error:
-            raise MechanismError(f"{self.name}: Pinocchio cannot build this tree: {error}") from None
+            raise MechanismError(f"{self.source}: Pinocchio cannot build this tree: {error}") from None
         return tree, Frames(tree.model), urdf
 
     def build_mechanism(self) -> Mechanism:
@@ -206,92 +136,3 @@ def _try_to_build(draft: Draft) -> Mechanism | None:
         return draft.build_mechanism()
     except MechanismError:
         return None
-
-
-# --- names and frames ----------------------------------------------------------------------------------------------
-
-
-def make_frame(link: str, pose: pin.SE3) -> Frame:
-    """Return a frame at a pose in a link; only the link's name where the pose is the identity."""
-    xyz, rpy = round_vector(pose.translation), round_vector(to_rpy(pose.rotation))
-    return FrameSpec(link=link, xyz=xyz, rpy=rpy) if any((*xyz, *rpy)) else link
-
-
-def choose_name(path: Path, declared: str = "") -> str:
-    """Name a mechanism after its file, or after its folder or its declared name where the file's name is generic."""
-    for candidate in (path.stem, path.absolute().parent.name, declared):
-        cleaned = re.sub(r"[^\w-]+", "_", candidate).strip("_-")[:MAX_NAME_CHARACTERS]
-        if cleaned and cleaned.lower() not in GENERIC_NAMES:
-            return cleaned
-    return "imported"
-
-
-def list_names(names: Sequence[str]) -> str:
-    """Return the first names as text, with the number of names that are not listed."""
-    omitted = len(names) - MAX_LISTED_NAMES
-    return ", ".join(names[:MAX_LISTED_NAMES]) + (f" and {omitted} more" if omitted > 0 else "")
-
-
-def make_unique(name: str, taken: Iterable[str]) -> str:
-    """Return the name, with a number appended if it is already taken."""
-    used = set(taken)
-    return next(n for n in (name, *(f"{name}_{k}" for k in range(2, len(used) + 3))) if n not in used)
-
-
-# --- numbers -------------------------------------------------------------------------------------------------------
-
-
-def round_number(x: float) -> float:
-    """Round a length or angle to 15 digits, which removes the rounding errors of a conversion.
-
-    Masses and inertias are not rounded: small ones are not errors.
-    """
-    return 0.0 if abs(x) < ZERO_TOLERANCE else float(f"{x:.15g}")
-
-
-def round_vector(values: Iterable[float]) -> Vector3:
-    """Return three numbers, rounded by `round_number`."""
-    x, y, z = (round_number(float(value)) for value in values)
-    return (x, y, z)
-
-
-def require_direction(values: Iterable[float], where: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Return a direction, not normalized.
-
-    Raises
-    ------
-    InputError
-        All three numbers are zero.
-    """
-    direction = np.array([float(x) for x in values])
-    if not np.linalg.norm(direction) > 0:
-        raise InputError(f"{where}: expected a direction, got {direction.tolist()}")
-    return direction
-
-
-# --- rotations -----------------------------------------------------------------------------------------------------
-
-
-def from_quaternion(quaternion: Sequence[float]) -> Array:
-    """Return the rotation matrix of a quaternion (w, x, y, z), which need not be normalized."""
-    return np.array(pin.Quaternion(*map(float, quaternion)).normalized().matrix())
-
-
-def from_axis_angle(axis: Array, angle: float) -> Array:
-    """Return the rotation matrix for an angle (rad) about an axis, which need not be normalized."""
-    return np.array(pin.AngleAxis(float(angle), np.asarray(axis, dtype=float) / np.linalg.norm(axis)).matrix())
-
-
-def from_rpy(rpy: Sequence[float]) -> Array:
-    """Return the rotation matrix of a URDF's roll, pitch and yaw (rad)."""
-    return np.array(pin.rpy.rpyToMatrix(*map(float, rpy)))
-
-
-def to_rpy(rotation: Array) -> tuple[float, float, float]:
-    """Return a URDF's roll, pitch and yaw (rad) of a rotation matrix.
-
-    At a pitch of +-90 degrees only the sum or difference of roll and yaw is determined; one of the solutions is
-    returned.
-    """
-    roll, pitch, yaw = map(float, pin.rpy.matrixToRpy(np.ascontiguousarray(rotation)))
-    return roll, pitch, yaw

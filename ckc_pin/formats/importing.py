@@ -1,7 +1,7 @@
 """Read a file of another program's format, and write it as ``mechanism.toml`` with a URDF.
 
-Supported: MuJoCo's MJCF, and URDFs whose loops are declared by <loop> (generalized_rbda), by a robot.yaml
-(example-parallel-robots), by pairs of closing frames (onshape-to-robot), or not at all.
+Supported: MuJoCo's MJCF, SDFormat, and URDFs whose loops are declared in one of several dialects, by a file beside
+them, by pairs of closing frames, or not at all.
 """
 
 from __future__ import annotations
@@ -18,23 +18,32 @@ from ckc_pin.base.toml import read_text
 from ckc_pin.base.toml_writer import LINE_WIDTH, format_key, format_value, to_table
 from ckc_pin.errors import InputError
 from ckc_pin.formats.draft import Draft, choose_independent
+from ckc_pin.formats.loop_types import propose_loop_types
 from ckc_pin.formats.mjcf.reader import read_mjcf
-from ckc_pin.formats.urdf.reader import find_urdf_beside, read_urdf
+from ckc_pin.formats.physics import check_physics
+from ckc_pin.formats.robot import Robot
+from ckc_pin.formats.sdf.reader import read_sdf
+from ckc_pin.formats.tree import make_draft
+from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML
+from ckc_pin.formats.urdf.reader import ROBOT_YAML, find_urdf_beside, read_urdf
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import LoopType
 
-__all__ = ["Draft", "mechanism_text", "read", "write"]
+__all__ = ["Draft", "mechanism_text", "read", "read_robot", "write"]
 
 LOOP_TYPES = get_args(LoopType)
+READERS = {"mujoco": read_mjcf, "robot": read_urdf, "sdf": read_sdf}  # by the root element
 
 
-def read(path: Path) -> Draft:
+def read(path: Path, repair: bool = False) -> Draft:
     """Read a file of another program's format.
 
     Parameters
     ----------
     path : Path
-        A MuJoCo model, a URDF, or a robot.yaml with its URDF in the same folder.
+        A MuJoCo model, an SDFormat file, a URDF, or a robot.yaml or loop_closures.yaml beside its URDF.
+    repair : bool
+        Whether impossible inertias and swapped limits are replaced by possible ones, instead of being refused.
 
     Returns
     -------
@@ -45,19 +54,32 @@ def read(path: Path) -> Draft:
     InputError, MechanismError
         The file is not of a supported format, or an element of it is invalid. The message names the element.
     """
+    robot = read_robot(path)
+    check_physics(robot, repair)
+    draft = make_draft(robot)
+    propose_loop_types(draft)
+    _remove_loops_within_a_body(draft)
+    choose_independent(draft)
+    return draft
+
+
+def read_robot(path: Path) -> Robot:
+    """Read a file of another program's format as a graph of links and joints."""
     if path.suffix in (".yaml", ".yml"):
-        if path.name != "robot.yaml":
-            raise InputError(f"{path}: cannot import this YAML file; it would have to be a robot.yaml beside its URDF")
+        if path.name not in (ROBOT_YAML, LOOP_CLOSURES_YAML):
+            raise InputError(
+                f"{path}: cannot import this YAML file; it would have to be a {ROBOT_YAML} or a {LOOP_CLOSURES_YAML} "
+                "beside its URDF"
+            )
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
     text = read_text(path, "robot file")
     tag = parse_xml(text, str(path)).tag
-    if tag not in ("mujoco", "robot"):
-        raise InputError(f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF) or <robot> (URDF)")
-    draft = read_mjcf(text, path) if tag == "mujoco" else read_urdf(text, path)
-    _remove_loops_within_a_body(draft)
-    choose_independent(draft)
-    return draft
+    if tag not in READERS:
+        raise InputError(
+            f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF), <robot> (URDF) or <sdf> (SDFormat)"
+        )
+    return READERS[tag](text, path)
 
 
 def _remove_loops_within_a_body(draft: Draft) -> None:
@@ -104,7 +126,7 @@ def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
 def mechanism_text(draft: Draft) -> str:
     """Return the text of ``mechanism.toml``, with the notes on what was guessed and left out as comments."""
     lines = [*_comment(f"Imported from {draft.origin}. Read it, correct it, keep it."), ""]
-    for title, items in (("Guessed", draft.guessed), ("Left out", draft.left_out)):
+    for title, items in (("Warnings", draft.warnings), ("Guessed", draft.guessed), ("Left out", draft.left_out)):
         if items:
             lines += [f"# {title}:", *(line for item in items for line in _comment(item, "#   - ", "#     ")), ""]
     spec = draft.to_spec()

@@ -47,7 +47,8 @@ def test_imported_mechanism_passes_check(folder: Path) -> None:
 
 def test_json_has_files_notes_and_check(folder: Path) -> None:
     result = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
-    assert set(result) == {"status", "written", "left_out", "guessed", "check"}
+    assert set(result) == {"status", "format", "written", "warnings", "left_out", "guessed", "check"}
+    assert result["format"] == "linkage.xml, a MuJoCo model"
     assert result["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
     assert result["left_out"] == []
     assert result["guessed"] == ["ranges are hard stops without rebound; in MuJoCo they are soft: a"]
@@ -150,8 +151,10 @@ CASES = [
     Bad("not text", X, ["m.xml", "not UTF-8"], files={"m.xml": b"\xff\xfe\x00"}),
     Bad("an entity bomb", X, ["document type declaration (x) is not accepted"], files={"m.xml": BOMB}),
     Bad("deep XML", X, ["nested more than 300 deep"], files={"m.xml": "<body>" * 1000 + "</body>" * 1000}),
-    Bad("another XML", X, ["root element is <sdf>", "<mujoco> (MJCF) or <robot> (URDF)"], files={"m.xml": "<sdf/>"}),
-    Bad("another YAML", ["import", "x.yaml"], ["have to be a robot.yaml beside its URDF"], files={"x.yaml": ""}),
+    Bad("another XML", X, ["root element is <svg>", "<robot> (URDF) or <sdf>"], files={"m.xml": "<svg/>"}),
+    Bad(
+        "another YAML", ["import", "x.yaml"], ["have to be a robot.yaml or a loop_closures.yaml"], files={"x.yaml": ""}
+    ),
     Bad(
         "a yaml alone",
         ["import", "robot.yaml"],
@@ -189,10 +192,10 @@ CASES = [
     Bad("bad solid", X, ["<mesh> 'm'", "m.stl"], files=mjcf(MESH, MESH_ASSET) | {"m.stl": "version of a pointer"}),
     Bad("a cable", X, ["'B_last'", "not read: <composite>"], files=mjcf("<composite/>" + BODY, CABLE)),
     # MJCF: refused before MuJoCo reads it
-    Bad("an include from outside", X, ["include file='../x'"], files=mjcf("<include file='../x'/>")),
+    Bad("an include from outside", X, ["file='../../../x'", "repository"], files=mjcf("<include file='../../../x'/>")),
     Bad("an include of itself", X, ["'m.xml' is included twice"], files=mjcf("<include file='m.xml'/>")),
     Bad("an include of nothing", X, ["n.xml: no such MuJoCo model"], files=mjcf("<include file='n.xml'/>")),
-    Bad("a model from outside", X, ["model file='../x'"], files=mjcf("", "<asset><model file='../x'/></asset>")),
+    Bad("a model from outside", X, ["file='../../../x'"], files=mjcf("", "<asset><model file='../../../x'/></asset>")),
     Bad("a model of itself", X, ["cannot contain itself"], files=mjcf("", "<asset><model file='m.xml'/></asset>")),
     Bad(
         "a bad model",

@@ -68,14 +68,28 @@ def test_shape_of_a_plugin_has_no_mass(tmp_path: Path) -> None:
     assert has_note(draft.left_out, "wheel (mesh gear)", "<inertial>")
 
 
-def test_meshes_outside_the_folder_are_not_opened(tmp_path: Path) -> None:
-    (tmp_path / "inside").mkdir()
+def test_meshes_outside_the_repository_are_not_opened(tmp_path: Path) -> None:
+    (tmp_path / "inside" / ".git").mkdir(parents=True)
     (tmp_path / "hull.stl").write_bytes(tetrahedron())
     (tmp_path / "inside" / "link.stl").symlink_to(tmp_path / "hull.stl")
     body = "<body name='hull'><joint/><geom type='mesh' mesh='hull_shape'/><geom size='.1' mass='2'/></body>"
     (tmp_path / "inside" / "circle.stl").symlink_to("circle.stl")
     for file in ("../hull.stl", "link.stl", str(tmp_path / "hull.stl"), "circle.stl", "x" * 300 + ".stl"):
         assert has_note(model(tmp_path / "inside", body, HULL.format(file)).left_out, "hull (mesh hull_shape)")
+
+
+def test_files_above_the_model_are_read_inside_its_repository(tmp_path: Path) -> None:
+    """A mesh gives the mass: the tetrahedron of 1/6 m^3 at the hull's density of 6 kg/m^3."""
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "hull.stl").write_bytes(tetrahedron())
+    (tmp_path / "parts.xml").write_text("<mujocoinclude><default><geom density='6'/></default></mujocoinclude>")
+    body = "<body name='hull'><joint/><geom type='mesh' mesh='hull_shape'/></body>"
+    deep = tmp_path / "a" / "b" / "c" / "d"
+    deep.mkdir(parents=True)
+    up = "../" * 4
+    draft = model(deep, body, HULL.format(f"{up}meshes/hull.stl") + f"<include file='{up}parts.xml'/>")
+    assert_close(float(draft.robot.find("link[@name='hull']/inertial/mass").get("value")), 6 / 6, 1e-6)
 
 
 def test_textures_are_not_opened(tmp_path: Path) -> None:
@@ -130,7 +144,7 @@ def test_active_ranges_are_stops_and_others_are_limits(tmp_path: Path) -> None:
     assert (mechanism.joints.lower[0], mechanism.joints.upper[0], mechanism.joints.restitution[0]) == (-1.0, 2.0, 0.0)
     assert np.isinf(mechanism.joints.lower[1:]).all()
     assert draft.left_out == ["range of ball joint ball"]
-    assert draft.guessed[1:] == ["ranges are hard stops without rebound; in MuJoCo they are soft: acts"]
+    assert draft.guessed[:1] == ["ranges are hard stops without rebound; in MuJoCo they are soft: acts"]
     assert mechanism.warnings == [
         "joint limits are not stops, so a run may pass them: rests; stops = true in their [[joint]] adds stops"
     ]

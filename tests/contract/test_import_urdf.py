@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ckc_pin import load
-from ckc_pin.formats.draft import from_rpy, to_rpy
+from ckc_pin.formats.conversion import from_rpy, to_rpy
 from ckc_pin.formats.importing import Draft, mechanism_text, read
 from tests.conftest import assert_close
 

@@ -56,7 +56,10 @@ ROBOTS = {
 
 
 def robot(file: str) -> Draft:
-    return read(resolve_path(f"package://example-robot-data/robots/{file}", Path(), "test"))
+    """A robot with a motor on every freedom, in place of the file's motors."""
+    draft = read(resolve_path(f"package://example-robot-data/robots/{file}", Path(), "test"))
+    draft.motors, draft.actuated, draft.independent = [], None, None
+    return draft
 
 
 def write_with_scene(draft: Draft, folder: Path) -> Path:

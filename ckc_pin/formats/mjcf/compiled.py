@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ckc_pin.errors import InputError
-from ckc_pin.formats.draft import list_names, make_unique
+from ckc_pin.formats.conversion import list_names, make_unique
 from ckc_pin.formats.mjcf.document import MAX_MAGNITUDE, Document
 
 __all__ = ["Compiled"]

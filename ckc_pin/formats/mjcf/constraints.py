@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.formats.draft import from_quaternion, make_frame, make_unique, round_number, round_vector
+from ckc_pin.formats.conversion import from_quaternion, make_frame, make_unique, round_number, round_vector
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.tree import MjcfTree, Placed
 from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec, SpringSpec

@@ -3,7 +3,7 @@
 MuJoCo's compiler opens any file that a model names and allocates any size that a model asks for. A model from an
 untrusted source is therefore prepared here:
 
-- Included and attached models are read here, only from the model's own folder.
+- Included and attached models are read here, only from the model's own repository.
 - Mesh files are replaced by tokens. MuJoCo gets their content, never a path.
 - The numbers of bodies and elements are bounded.
 - Elements that neither move nor have mass (textures, cameras, sensors, contacts) are removed. A note names each removed
@@ -21,6 +21,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from ckc_pin.base.sources import MAX_XML_DEPTH, parse_xml
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError
+from ckc_pin.formats.repository import repository_of, resolve_links
 
 __all__ = ["MAX_MAGNITUDE", "Document"]
 
@@ -63,7 +64,7 @@ class _ModelFiles:
     Attributes
     ----------
     folder : Path
-        The model's folder. No file outside it is opened.
+        The model's repository. No file outside it is opened.
     paths : dict of str to Path
         Mesh file of each token. It need not exist.
     models : int
@@ -91,22 +92,22 @@ class _ModelFiles:
         Raises
         ------
         InputError
-            The file is not in the model's folder.
+            The file is not in the model's repository.
         """
-        path = _resolve_links(folder / file)
+        path = resolve_links(folder / file)
         if not file or path is None or not path.is_relative_to(self.folder):
-            raise InputError(f"{where}: expected a file in the model's own folder")
+            raise InputError(f"{where}: expected a file in the model's repository {self.folder.name!r}")
         return path
 
     def read_mesh(self, token: str) -> bytes | None:
-        """Return the content of a mesh file; None if it is not readable or not in the model's folder.
+        """Return the content of a mesh file; None if it is not readable or not in the model's repository.
 
         Raises
         ------
         InputError
             The file is too large.
         """
-        path = _resolve_links(self.paths[token])
+        path = resolve_links(self.paths[token])
         if path is None or not path.is_relative_to(self.folder):
             return None
         try:
@@ -120,14 +121,6 @@ class _ModelFiles:
             return None
 
 
-def _resolve_links(path: Path) -> Path | None:
-    """Return a path without symbolic links; None if these form a cycle."""
-    try:
-        return path.resolve()
-    except (OSError, RuntimeError):
-        return None
-
-
 def _expand_includes(
     element: Element, folder: Path, files: _ModelFiles, seen: set[Path], source: str, depth: int = 0
 ) -> None:
@@ -136,7 +129,7 @@ def _expand_includes(
     Raises
     ------
     InputError
-        A file is included twice, is not in the model's folder, or is not XML.
+        A file is included twice, is not in the model's repository, or is not XML.
     """
     if depth > MAX_XML_DEPTH:
         raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
@@ -189,10 +182,10 @@ class Document:
         Raises
         ------
         InputError
-            The XML is malformed, a file is outside the model's folder or included twice, a number is not finite, or
+            The XML is malformed, a file is outside the model's repository or included twice, a number is not finite, or
             there are too many bodies.
         """
-        document = cls._read(text, path.absolute(), str(path), _ModelFiles(path.absolute().parent.resolve()), ())
+        document = cls._read(text, path.absolute(), str(path), _ModelFiles(repository_of(path.absolute().parent)), ())
         bodies, elements = document._count()
         if bodies > MAX_BODIES or elements > MAX_ELEMENTS:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Read a MuJoCo model into a draft: tree, loops, springs, motors and points.
+"""Read a MuJoCo model into a robot: tree, loops, springs, motors and points.
 
 Actuators become motors with their gears and limits, or constant forces. Gains are left out, because they belong to
 MuJoCo's own controllers.
@@ -13,17 +13,18 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.formats.draft import Draft, choose_name, list_names, make_frame, round_number, round_vector
+from ckc_pin.formats.conversion import choose_name, list_names, make_frame, round_number, round_vector
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.constraints import Equalities, Tendons
 from ckc_pin.formats.mjcf.document import Document
 from ckc_pin.formats.mjcf.tree import MjcfTree
+from ckc_pin.formats.robot import Robot
 from ckc_pin.mechanism.spec import ForceSpec, MotorSpec, PointSpec
 
 __all__ = ["read_mjcf"]
 
 
-def read_mjcf(text: str, path: Path) -> Draft:
+def read_mjcf(text: str, path: Path) -> Robot:
     """Read a MuJoCo model.
 
     Parameters
@@ -48,18 +49,18 @@ def read_mjcf(text: str, path: Path) -> Draft:
     springs, tendon_notes = tendons.springs(tree)
     actuators = _Actuators(compiled, tree)
     name = choose_name(path, document.root.get("model", ""))
-    tree.robot.set("name", name)
     has_medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
     disabled = _disabled_features(compiled)
-    return Draft(
-        name,
-        f"{path.name}, a MuJoCo model",
-        tree.robot,
+    return Robot(
+        name=name,
+        origin=f"{path.name}, a MuJoCo model",
+        source=str(path),
+        links=tree.links,
+        joints=tree.joints,
         loops=equalities.loops,
         couplings=equalities.couplings,
-        springs=tree.springs + springs,
+        springs=springs,
         forces=actuators.forces,
-        joints=tree.joints,
         motors=[(motor, "") for motor in actuators.motors],
         points=_free_sites(compiled, tree),
         actuated=actuators.joints or None,

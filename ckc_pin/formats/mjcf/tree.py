@@ -11,13 +11,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.formats.draft import (
+from ckc_pin.formats.conversion import (
     from_axis_angle,
     from_quaternion,
     list_names,
@@ -27,17 +26,8 @@ from ckc_pin.formats.draft import (
     to_rpy,
 )
 from ckc_pin.formats.mjcf.compiled import Compiled
-from ckc_pin.formats.urdf.elements import (
-    UNLIMITED,
-    Body,
-    JointLimits,
-    add_inertial,
-    add_joint,
-    add_link,
-    add_shape,
-    format_numbers,
-)
-from ckc_pin.mechanism.spec import JointSpec, SpringSpec
+from ckc_pin.formats.robot import UNLIMITED, Body, Joint, JointAxis, JointKind, JointLimits, Link, ball_axes
+from ckc_pin.formats.urdf.elements import format_numbers, make_visual
 
 __all__ = ["MjcfTree", "Placed"]
 
@@ -191,28 +181,24 @@ class MjcfTree:
 
     Attributes
     ----------
-    robot : Element
-        The URDF.
+    links : dict of str to Link
+    joints : dict of str to Joint
     bodies : list of Placed
         By MuJoCo's number.
     ref : dict of int to float
         By number, the joints of one freedom with their values in the reference pose, rad or m.
     q_guess : dict of str to float
         The reference pose, or the key frame that `ckc export` writes: coordinates that are not zero.
-    springs : list of (SpringSpec, comment)
-    joints : list of (JointSpec, comment)
-        Armature, and ranges that act as stops, which a URDF cannot express.
     guessed, left_out : list of str
     """
 
     compiled: Compiled
     used_joints: set[int]
-    robot: Element = field(default_factory=lambda: Element("robot"))
+    links: dict[str, Link] = field(default_factory=dict)
+    joints: dict[str, Joint] = field(default_factory=dict)
     bodies: list[Placed] = field(default_factory=list)
     ref: dict[int, float] = field(default_factory=dict)
     q_guess: dict[str, float] = field(default_factory=dict)
-    springs: list[tuple[SpringSpec, str]] = field(default_factory=list)
-    joints: list[tuple[JointSpec, str]] = field(default_factory=list)
     guessed: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -220,7 +206,7 @@ class MjcfTree:
         model = self.model = self.compiled.model
         self._link_names, self._joint_names = {"world", *self.compiled.bodies}, set(self.compiled.joints)
         self._start = model.key_qpos[0] if model.nkey else model.qpos0
-        self._links = {"world": add_link(self.robot, "world")}
+        self.links["world"] = Link()
         self.bodies.append(Placed("world", pin.SE3.Identity()))
         for body in range(1, model.nbody):
             self._add_body(body)
@@ -232,9 +218,9 @@ class MjcfTree:
         model = self.model
         return self.bodies[model.site_bodyid[number]].at(_pose(model.site_quat, model.site_pos, number))
 
-    def _link_of(self, geom: int) -> tuple[Element, pin.SE3]:
+    def _link_of(self, geom: int) -> tuple[Link, pin.SE3]:
         body = self.bodies[self.model.geom_bodyid[geom]]
-        return self._links[body.link], body.pose * _pose(self.model.geom_quat, self.model.geom_pos, geom)
+        return self.links[body.link], body.pose * _pose(self.model.geom_quat, self.model.geom_pos, geom)
 
     def _add_notes(self, undrawn: int) -> None:
         model, names = self.model, self.compiled.bodies
@@ -243,7 +229,7 @@ class MjcfTree:
             "gravity compensation of bodies": [names[k] for k in np.flatnonzero(model.body_gravcomp)],
         }
         self.left_out += [f"{note}: {list_names(affected)}" for note, affected in notes.items() if affected]
-        with_stops = [spec.name for spec, _ in self.joints if spec.stops]
+        with_stops = [joint.name for joint in self.joints.values() if any(axis.stops for axis in joint.axes)]
         if with_stops:
             self.guessed.append(
                 f"ranges are hard stops without rebound; in MuJoCo they are soft: {list_names(with_stops)}"
@@ -277,7 +263,7 @@ class MjcfTree:
         else:
             pose = self._add_chain(joints, name, start)
         self.bodies.append(Placed(name, pose))
-        add_inertial(self._links[name], self._inertia(number).transformed(pose))
+        self.links[name].body = self._inertia(number).transformed(pose)
 
     def _inertia(self, number: int) -> Body:
         """Return mass and inertia of a body in the body's frame."""
@@ -316,43 +302,32 @@ class MjcfTree:
 
     def _add_hinge_or_slide(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
         """Add a joint of one freedom with its range, damping, friction and spring."""
-        kind = "prismatic" if joint.kind == "slide" else ("continuous" if joint.limits.lower is None else "revolute")
-        self._add_joint(
-            joint.name,
-            kind,
-            link,
-            child,
-            origin,
-            axis=round_vector(joint.axis),
+        axis = JointAxis(
+            np.array(round_vector(joint.axis)),
+            slides=joint.kind == "slide",
             limits=joint.limits,
             damping=joint.damping,
             friction=joint.friction,
+            armature=joint.armature,
+            stiffness=joint.stiffness,
+            rest=joint.rest,
+            stops=joint.has_stops,
         )
-        if joint.stiffness:
-            spec = SpringSpec(joint=joint.name, stiffness=joint.stiffness, rest=round_number(joint.rest))
-            self.springs.append((spec, "the joint's stiffness"))
+        self._add_joint(joint.name, "prismatic" if axis.slides else "revolute", link, child, origin, [axis])
         if joint.is_nonlinear:
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {joint.name}")
-        if joint.armature or joint.has_stops:
-            table = JointSpec(name=joint.name, armature=joint.armature or None, stops=joint.has_stops)
-            self.joints.append((table, ""))
         self.ref[joint.number] = round_number(joint.ref)
         self._set_guess([joint.name], [self._start[joint.qpos_index]])
 
     def _add_ball(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
         """Add three hinges in series for a ball joint."""
         names = [make_unique(f"{joint.name}_{axis}", self._joint_names) for axis in "xyz"]
-        for position, (name, axis) in enumerate(zip(names, np.eye(3), strict=True)):
-            next_link = child if position == 2 else make_unique(f"{child}_{'xy'[position]}", self._link_names)
-            self._joint_names.add(name)
-            self._add_joint(name, "continuous", link, next_link, origin, axis=round_vector(axis))
-            link, origin = next_link, pin.SE3.Identity()
+        self._joint_names.update(names)
+        suffixes = [name.removeprefix(joint.name) for name in names]
+        self._add_joint(joint.name, "ball", link, child, origin, ball_axes(suffixes))
         rotation = from_quaternion(self._start[joint.qpos_index : joint.qpos_index + 4])
         # The hinges turn about x, y and z in this order, so their angles are those of the inverse with opposite sign.
         self._set_guess(names, [-angle for angle in to_rpy(rotation.T)])
-        self.guessed.append(
-            f"ball joint {joint.name} is three hinges, {', '.join(names)}: singular where {names[1]} is +-90 degrees"
-        )
         if joint.nonzero_properties:
             self.left_out.append(f"{', '.join(joint.nonzero_properties)} of ball joint {joint.name}")
 
@@ -360,26 +335,29 @@ class MjcfTree:
         rounded = {label: round_number(float(x)) for label, x in zip(labels, values, strict=True)}
         self.q_guess |= {label: x for label, x in rounded.items() if x != 0}
 
-    def _add_joint(self, name: str, kind: str, parent: str, child: str, origin: pin.SE3, **properties: Any) -> None:
+    def _add_joint(
+        self, name: str, kind: JointKind, parent: str, child: str, origin: pin.SE3, axes: Sequence[JointAxis] = ()
+    ) -> None:
         self._link_names.add(child)
-        self._links[child] = add_link(self.robot, child)
-        add_joint(self.robot, name, kind, parent, child, origin, **properties)
+        self.links[child] = Link()
+        self.joints[name] = Joint(name, kind, parent, child, origin, axes=list(axes))
 
 
 def _pose(quaternions: Array, positions: Array, number: int) -> pin.SE3:
     return pin.SE3(from_quaternion(quaternions[number]), positions[number].copy())
 
 
-def _draw_shape(model: Any, geom: int, link: Element, pose: pin.SE3) -> bool:
-    """Add a shape to a link as a visual; return False if URDF has no such shape."""
+def _draw_shape(model: Any, geom: int, link: Link, pose: pin.SE3) -> bool:
+    """Add a shape to a link; return False if URDF has no such shape."""
     kind = int(model.geom_type[geom])
     radius, half, _ = (float(x) for x in model.geom_size[geom])
     if kind == SPHERE:
-        add_shape(link, pose, "sphere", radius=repr(radius))
+        link.visuals.append(make_visual(pose, "sphere", radius=repr(radius)))
     elif kind == BOX:
-        add_shape(link, pose, "box", size=format_numbers(2 * model.geom_size[geom]))
+        link.visuals.append(make_visual(pose, "box", size=format_numbers(2 * model.geom_size[geom])))
     elif kind in (CYLINDER, CAPSULE):
-        add_shape(link, pose, "cylinder", radius=repr(radius), length=repr(2 * half))
+        link.visuals.append(make_visual(pose, "cylinder", radius=repr(radius), length=repr(2 * half)))
         for z in (-half, half) if kind == CAPSULE else ():
-            add_shape(link, pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, z])), "sphere", radius=repr(radius))
+            end = pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, z]))
+            link.visuals.append(make_visual(end, "sphere", radius=repr(radius)))
     return kind in (SPHERE, BOX, CYLINDER, CAPSULE)

@@ -1,86 +1,36 @@
-"""Elements of a URDF: an index of links and joints by name, parsing of vectors and poses, and building of elements."""
+"""Elements of a URDF: parsing of vectors and poses, and building of elements."""
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from copy import deepcopy
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
-from ckc_pin.formats.draft import from_rpy, round_number, to_rpy
+from ckc_pin.formats.conversion import from_rpy, round_number, to_rpy
+from ckc_pin.formats.robot import UNLIMITED, Body, JointAxis
 
 __all__ = [
-    "UNLIMITED",
-    "Body",
-    "JointLimits",
-    "UrdfIndex",
     "add_inertial",
     "add_joint",
     "add_link",
-    "add_shape",
     "format_numbers",
+    "from_pose",
+    "make_visual",
+    "move_visual",
     "parse_origin",
     "parse_vector",
 ]
 
-MAX_SUGGESTIONS = 3  # similar names in a message about an unknown one
+UNBOUNDED = 1e308  # the limit of a URDF that stands for none
 INERTIA_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
 
 # --- reading -------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class UrdfIndex:
-    """Links and joints of a URDF by name.
-
-    Attributes
-    ----------
-    links, joints : dict of str to Element
-    parent_joint : dict of str to Element
-        The joint that carries a link, by the link's name.
-    split_joints : dict of str to list of str
-        Joints that were replaced by several, with the names of these.
-    """
-
-    links: dict[str, Element]
-    joints: dict[str, Element]
-    parent_joint: dict[str, Element]
-    split_joints: dict[str, list[str]] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, robot: Element) -> UrdfIndex:
-        """Index a URDF whose names are unique, as `ckc_pin.mechanism.urdf.parse` checks."""
-        index = cls({}, {}, {})
-        index._collect(robot)
-        return index
-
-    def update_after_split(self, joint: str, robot: Element) -> None:
-        """Index the URDF again after one joint was replaced by several."""
-        before = set(self.joints)
-        self._collect(robot)
-        self.split_joints[joint] = [name for name in self.joints if name not in before]
-
-    @property
-    def split_results(self) -> set[str]:
-        """Names of the joints that replaced others."""
-        return {name for names in self.split_joints.values() for name in names}
-
-    def suggest_names(self, name: str) -> str:
-        """Return the end of a message about an unknown name: similar names of links and joints, or nothing."""
-        similar = difflib.get_close_matches(name, [*self.links, *self.joints], MAX_SUGGESTIONS)
-        return f"; did you mean {', '.join(similar)}?" if similar else ""
-
-    def _collect(self, robot: Element) -> None:
-        self.links = {e.attrib["name"]: e for e in robot.findall("link")}
-        self.joints = {e.attrib["name"]: e for e in robot.findall("joint")}
-        self.parent_joint = {j.find("child").attrib["link"]: j for j in self.joints.values()}  # type: ignore[union-attr]
 
 
 def parse_origin(element: Element, where: str) -> pin.SE3:
@@ -93,7 +43,7 @@ def parse_origin(element: Element, where: str) -> pin.SE3:
     """
     origin = element.find("origin")
     xyz, rpy = (parse_vector(origin, key, "0 0 0", f"{where}, <origin>") for key in ("xyz", "rpy"))
-    return pin.SE3(from_rpy(rpy), np.array(xyz))
+    return from_pose(xyz, rpy)
 
 
 def parse_vector(element: Element | None, attribute: str, default: str, where: str) -> list[float]:
@@ -114,32 +64,12 @@ def parse_vector(element: Element | None, attribute: str, default: str, where: s
     return values
 
 
+def from_pose(xyz: Sequence[float], rpy: Sequence[float]) -> pin.SE3:
+    """Return a pose given as a URDF gives it."""
+    return pin.SE3(from_rpy(rpy), np.array([float(x) for x in xyz]))
+
+
 # --- building ------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Body:
-    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), the last two in the axes of one frame."""
-
-    mass: float
-    centre: Array
-    inertia: Array
-
-    def transformed(self, pose: pin.SE3) -> Body:
-        """Return the body in the axes of the frame in which `pose` is given."""
-        return Body(self.mass, pose.act(self.centre), pose.rotation @ self.inertia @ pose.rotation.T)
-
-
-@dataclass(frozen=True)
-class JointLimits:
-    """Range of a joint (rad or m; None: unlimited) and its largest force or torque."""
-
-    lower: float | None = None
-    upper: float | None = None
-    effort: float = 0.0
-
-
-UNLIMITED = JointLimits()
 
 
 def add_link(robot: Element, name: str) -> Element:
@@ -158,37 +88,49 @@ def add_inertial(link: Element, body: Body) -> None:
 
 
 def add_joint(
-    robot: Element,
-    name: str,
-    kind: str,
-    parent: str,
-    child: str,
-    origin: pin.SE3,
-    *,
-    axis: Sequence[float] | Array = (),
-    limits: JointLimits = UNLIMITED,
-    damping: float = 0.0,
-    friction: float = 0.0,
+    robot: Element, name: str, kind: str, parent: str, child: str, origin: pin.SE3, axis: JointAxis | None = None
 ) -> None:
-    """Add a <joint> of a type that URDF has; `origin` is the joint's frame in the parent link."""
+    """Add a <joint>; `origin` is the joint's frame in the parent link. An axis determines the kind."""
+    limits = UNLIMITED if axis is None else axis.limits
+    is_bounded = limits.lower is not None or limits.upper is not None
+    if axis is not None:
+        kind = "prismatic" if axis.slides else "revolute" if is_bounded else "continuous"
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
     add_origin(joint, origin)
-    if len(axis):
-        SubElement(joint, "axis", xyz=format_numbers(axis))
-    if limits.lower is not None and limits.upper is not None:
-        limit = {"lower": repr(limits.lower), "upper": repr(limits.upper), "effort": repr(limits.effort)}
-        SubElement(joint, "limit", {**limit, "velocity": "0"})
-    if damping or friction:
-        SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
+    if axis is None:
+        return
+    SubElement(joint, "axis", xyz=format_numbers(axis.direction))
+    if is_bounded or limits.effort or limits.velocity:
+        values = {"effort": limits.effort, "velocity": limits.velocity}
+        if is_bounded:
+            values["lower"] = -UNBOUNDED if limits.lower is None else limits.lower
+            values["upper"] = UNBOUNDED if limits.upper is None else limits.upper
+        SubElement(joint, "limit", {key: repr(float(value)) for key, value in values.items()})
+    if axis.damping or axis.friction:
+        SubElement(joint, "dynamics", damping=repr(axis.damping), friction=repr(axis.friction))
+    if axis.mimic is not None:
+        other, ratio, offset = axis.mimic
+        SubElement(joint, "mimic", joint=other, multiplier=repr(ratio), offset=repr(offset))
 
 
-def add_shape(link: Element, pose: pin.SE3, shape: str, **sizes: str) -> None:
-    """Add a <visual> to a link: a box, a cylinder or a sphere at a pose."""
-    visual = SubElement(link, "visual")
+def make_visual(pose: pin.SE3, shape: str, **sizes: str) -> Element:
+    """Return a <visual>: a box, a cylinder, a sphere or a mesh at a pose."""
+    visual = Element("visual")
     add_origin(visual, pose)
     SubElement(SubElement(visual, "geometry"), shape, sizes)
+    return visual
+
+
+def move_visual(visual: Element, pose: pin.SE3) -> Element:
+    """Return a <visual> in the axes of the frame in which `pose` is given."""
+    moved = deepcopy(visual)
+    origin = moved.find("origin")
+    if origin is not None:
+        moved.remove(origin)
+    add_origin(moved, pose * parse_origin(visual, "<visual>"))
+    return moved
 
 
 def add_origin(element: Element, pose: pin.SE3) -> None:

@@ -1,0 +1,340 @@
+"""A robot as a file of another program describes it: a graph of links and joints, with loops, couplings and notes.
+
+A reader of a format fills a `Robot` and knows nothing else. `ckc_pin.formats.tree` turns it into a tree with loop
+closures, which is what a mechanism file has.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
+from xml.etree.ElementTree import Element
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.base.arrays import Array
+from ckc_pin.errors import MechanismError
+from ckc_pin.mechanism.spec import CouplingSpec, ForceSpec, LoopSpec, MotorSpec, PointSpec, SpringSpec, Vector3
+
+__all__ = [
+    "UNLIMITED",
+    "Body",
+    "Joint",
+    "JointAxis",
+    "JointKind",
+    "JointLimits",
+    "Link",
+    "Mimic",
+    "Robot",
+    "Tables",
+    "ball_axes",
+]
+
+T = TypeVar("T")
+WithComment = list[tuple[T, str]]  # each table with its comment in the file; an empty comment is not written
+JointKind = Literal[  # hinges: several in a row
+    "fixed", "revolute", "prismatic", "floating", "ball", "universal", "cylindrical", "planar", "screw", "hinges"
+]
+Mimic = tuple[str, float, float]  # other joint, ratio, offset
+
+
+# --- links and joints ----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Body:
+    """Mass (kg), centre of mass (m) and inertia about it (kg m^2), the last two in the axes of one frame."""
+
+    mass: float = 0.0
+    centre: Array = field(default_factory=lambda: np.zeros(3))
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def transformed(self, pose: pin.SE3) -> Body:
+        """Return the body in the axes of the frame in which `pose` is given."""
+        return Body(self.mass, pose.act(self.centre), pose.rotation @ self.inertia @ pose.rotation.T)
+
+
+@dataclass
+class Link:
+    """A rigid body in its own frame: mass properties, and its shapes as <visual> elements of a URDF."""
+
+    body: Body = field(default_factory=Body)
+    visuals: list[Element] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Range of a joint (rad or m; None: unlimited), its largest force or torque and its largest speed (0: none)."""
+
+    lower: float | None = None
+    upper: float | None = None
+    effort: float = 0.0
+    velocity: float = 0.0
+
+
+UNLIMITED = JointLimits()
+
+
+@dataclass
+class JointAxis:
+    """One freedom of a joint.
+
+    Attributes
+    ----------
+    direction : (3,) array
+        Unit vector in the joint's frame.
+    slides : bool
+        Whether the joint slides along the axis, instead of turning about it.
+    limits : JointLimits
+    damping, friction, armature : float
+    stiffness, rest : float
+        Spring, and the position at which it has no force.
+    stops : bool
+        Whether the limits are stops.
+    mimic : (joint, ratio, offset) tuple, optional
+    suffix : str
+        Ending of the coordinate's name, if the joint has several axes.
+    """
+
+    direction: Array
+    slides: bool = False
+    limits: JointLimits = UNLIMITED
+    damping: float = 0.0
+    friction: float = 0.0
+    armature: float = 0.0
+    stiffness: float = 0.0
+    rest: float = 0.0
+    stops: bool = False
+    mimic: Mimic | None = None
+    suffix: str = ""
+
+    @property
+    def has_forces(self) -> bool:
+        """Whether the axis has forces, inertia or a coupling, which a loop closure cannot express."""
+        values = (self.damping, self.friction, self.armature, self.stiffness, self.stops, self.mimic)
+        return any(bool(value) for value in values)
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether the range is less than a full turn."""
+        lower, upper = self.limits.lower, self.limits.upper
+        if lower is None or upper is None:
+            return lower is not upper
+        return self.slides or upper - lower < 2 * np.pi
+
+
+@dataclass
+class Joint:
+    """A joint between two links: the frames that coincide at zero, and its axes in the order from parent to child.
+
+    Attributes
+    ----------
+    name : str
+    kind : str
+    parent, child : str
+        Links.
+    in_parent, in_child : SE3
+        The joint's frame in both links.
+    axes : list of JointAxis
+        A ball has three hinges about x, y and z.
+    pitch : float
+        Advance per turn of a screw, m/rad. Its axes are a hinge and a slide.
+    closes : bool
+        Whether the file declares it as the closure of a loop. It is cut first.
+    comment : str
+        On the loop, if the joint is cut.
+    """
+
+    name: str
+    kind: JointKind
+    parent: str
+    child: str
+    in_parent: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    in_child: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    axes: list[JointAxis] = field(default_factory=list)
+    pitch: float = 0.0
+    closes: bool = False
+    comment: str = ""
+
+    @classmethod
+    def between(
+        cls, name: str, kind: JointKind, links: Sequence[str], poses: Sequence[pin.SE3], axes: list[JointAxis]
+    ) -> Joint:
+        """Return a joint between two links, parent first, at its poses in both."""
+        return cls(name, kind, links[0], links[1], poses[0], poses[1], axes)
+
+    @property
+    def coordinates(self) -> list[str]:
+        """Names of the joints of one freedom that the joint becomes in a tree."""
+        if len(self.axes) < 2:
+            return [self.name] * len(self.axes)
+        return [f"{self.name}{axis.suffix or f'_{k + 1}'}" for k, axis in enumerate(self.axes)]
+
+    def reversed(self) -> Joint:
+        """Return the joint with parent and child exchanged, so that its coordinates keep their values."""
+        turned = [
+            replace(axis, direction=-axis.direction, suffix=name.removeprefix(self.name))
+            for axis, name in zip(reversed(self.axes), reversed(self.coordinates), strict=True)
+        ]
+        return replace(
+            self, parent=self.child, child=self.parent, in_parent=self.in_child, in_child=self.in_parent, axes=turned
+        )
+
+
+# --- robots --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(kw_only=True)
+class Tables:
+    """What a robot has besides its links and joints: tables of ``mechanism.toml``, and notes for the user.
+
+    Attributes
+    ----------
+    name : str
+        Name of the mechanism, and of its URDF.
+    origin : str
+        The file that was imported and its format. The first line of ``mechanism.toml`` quotes it.
+    loops, couplings, springs, forces, motors, points : list of (spec, comment)
+        Tables of ``mechanism.toml``. Frames are relative to the frames of the robot's links.
+    untyped : list of LoopSpec
+        Points that the file marks as coincident without the type of the joint, which is proposed from the geometry.
+    independent, actuated : list of str or None
+        None: the program chooses them. `actuated` also lists the joints of `motors`.
+    why_independent : str
+        Comment on `independent`.
+    gravity : (3,) tuple
+        m/s^2.
+    q_guess : dict of str to float
+        Start of the assembly by coordinate, rad or m.
+    key_frames : dict of str to (dict of str to float)
+        Further configurations by name.
+    guessed : list of str
+        What the file does not say, and what was assumed.
+    left_out : list of str
+        Content of the file that the mechanism does not have.
+    warnings : list of str
+        Why the mechanism has other freedoms than the file means.
+    """
+
+    name: str
+    origin: str
+    loops: WithComment[LoopSpec] = field(default_factory=list)
+    couplings: WithComment[CouplingSpec] = field(default_factory=list)
+    springs: WithComment[SpringSpec] = field(default_factory=list)
+    forces: WithComment[ForceSpec] = field(default_factory=list)
+    motors: WithComment[MotorSpec] = field(default_factory=list)
+    points: WithComment[PointSpec] = field(default_factory=list)
+    untyped: list[LoopSpec] = field(default_factory=list)
+    independent: list[str] | None = None
+    actuated: list[str] | None = None
+    why_independent: str = ""
+    gravity: Vector3 = (0.0, 0.0, -9.81)
+    q_guess: dict[str, float] = field(default_factory=dict)
+    key_frames: dict[str, dict[str, float]] = field(default_factory=dict)
+    guessed: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(kw_only=True)
+class Robot(Tables):
+    """A robot as a reader understood it. Joints may form loops.
+
+    Attributes
+    ----------
+    source : str
+        Name of the file in messages.
+    links : dict of str to Link
+    joints : dict of str to Joint
+    base : str
+        The link at which the tree begins; empty: the link that is no joint's child.
+    materials : list of Element
+        <material> elements that the links' shapes name.
+    """
+
+    source: str
+    links: dict[str, Link] = field(default_factory=dict)
+    joints: dict[str, Joint] = field(default_factory=dict)
+    base: str = ""
+    materials: list[Element] = field(default_factory=list)
+
+    def add_joint(self, joint: Joint) -> None:
+        """Add a joint.
+
+        Raises
+        ------
+        MechanismError
+            Its name is taken, a link does not exist, or it connects a link with itself.
+        """
+        where = f"{self.source}: joint {joint.name!r}"
+        if joint.name in self.joints:
+            raise MechanismError(f"{self.source}: two joints are called {joint.name!r}")
+        for end, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in self.links:
+                raise MechanismError(
+                    f"{where}: its {end} link {link!r} does not exist; there are {', '.join(self.links)}"
+                )
+        if joint.parent == joint.child:
+            raise MechanismError(f"{where}: it connects link {joint.child!r} with itself; expected two links")
+        self.joints[joint.name] = joint
+
+    def leave_out(self, unread: Counter[str]) -> None:
+        """Note elements that were not read; those that seem to close loops are warnings."""
+        for what, count in sorted(unread.items()):
+            if re.search(r"loop|clos|constraint|equality|weld|connect|joint:", what, re.IGNORECASE):
+                each = "each of them" if count > 1 else "it"
+                self.warnings.append(
+                    f"{count} {what}: the program cannot read it; if {each} closes a loop, the mechanism has up to 6 "
+                    f"freedoms more than meant for {each}; write a table [[loop]] instead"
+                )
+            else:
+                self.left_out.append(f"{count} {what}")
+
+    @property
+    def axes(self) -> dict[str, JointAxis]:
+        """Axes by the names of their coordinates."""
+        return {
+            name: axis
+            for joint in self.joints.values()
+            for name, axis in zip(joint.coordinates, joint.axes, strict=True)
+        }
+
+    def moving_joints(self) -> Iterator[Joint]:
+        """Yield the joints that are not fixed."""
+        yield from (joint for joint in self.joints.values() if joint.kind != "fixed")
+
+    def zero_poses(self) -> dict[str, pin.SE3]:
+        """Return the poses of the links at zero, relative to the base, without the joints that close loops."""
+        edges: dict[str, list[tuple[str, pin.SE3]]] = {name: [] for name in self.links}
+        for joint in self.joints.values():
+            if not joint.closes:
+                step = joint.in_parent * joint.in_child.inverse()
+                edges[joint.parent].append((joint.child, step))
+                edges[joint.child].append((joint.parent, step.inverse()))
+        poses: dict[str, pin.SE3] = {}
+        for base in (self.find_base(), *self.links):  # parts that only closing joints connect begin at identity
+            pending = [] if base in poses else [base]
+            poses.setdefault(base, pin.SE3.Identity())
+            while pending:
+                link = pending.pop()
+                for other, step in edges[link]:
+                    if other not in poses:
+                        poses[other] = poses[link] * step
+                        pending.append(other)
+        return poses
+
+    def find_base(self) -> str:
+        """Return the link at which the tree begins: `base`, "world", or the first link that is no joint's child."""
+        children = {joint.child for joint in self.joints.values() if not joint.closes}
+        roots = [name for name in self.links if name not in children]
+        choices = [self.base, *(["world"] if "world" in roots else []), *roots, *self.links]
+        return next(name for name in choices if name)
+
+
+def ball_axes(suffixes: Sequence[str] = ("_x", "_y", "_z")) -> list[JointAxis]:
+    """Return the axes of a ball joint."""
+    return [JointAxis(direction, suffix=suffix) for direction, suffix in zip(np.eye(3), suffixes, strict=True)]
