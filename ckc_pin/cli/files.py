@@ -120,7 +120,12 @@ def import_(file: Path, repair: bool, out: Path | None, overwrite: bool, as_json
     )
 )
 @options.mechanism
-@click.option("--to", type=click.Choice(["mjcf"]), default="mjcf", help="mjcf: a model of MuJoCo.")
+@click.option(
+    "--to",
+    type=click.Choice(["mjcf", "urdf", "sdf"]),
+    default="mjcf",
+    help="mjcf: for MuJoCo; urdf: a tree with <loop> elements; sdf: for Gazebo, with loops as joints.",
+)
 @options.out(help="Folder to write to; without it the model is printed.")
 @options.overwrite
 @options.as_json

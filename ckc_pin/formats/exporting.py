@@ -9,11 +9,13 @@ from pathlib import Path
 from ckc_pin.base.sources import write_texts
 from ckc_pin.errors import InputError
 from ckc_pin.formats.mjcf.writer import to_mjcf
+from ckc_pin.formats.sdf.writer import to_sdf
+from ckc_pin.formats.urdf.writer import to_urdf
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["FORMATS", "Exported", "export", "write"]
 
-FORMATS = {"mjcf": to_mjcf}
+FORMATS = {"mjcf": (to_mjcf, ".xml"), "urdf": (to_urdf, ".urdf"), "sdf": (to_sdf, ".sdf")}  # with suffixes
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ def export(mechanism: Mechanism, to: str, **options: float) -> Exported:
     ----------
     mechanism : Mechanism
     to : str
-        "mjcf": a MuJoCo model.
+        "mjcf": a MuJoCo model. "urdf": a tree with <loop> elements. "sdf": a world of SDFormat, as Gazebo reads it,
+        with its zero configuration where the mechanism is assembled.
     **options
         Of the format. "mjcf": `time_step`, s.
 
@@ -53,8 +56,9 @@ def export(mechanism: Mechanism, to: str, **options: float) -> Exported:
     """
     if to not in FORMATS:
         raise InputError(f"export: unknown format {to!r}; expected one of {', '.join(FORMATS)}")
-    text, differences = FORMATS[to](mechanism, **options)
-    return Exported(re.sub(r"[^\w.-]+", "_", mechanism.name) + ".xml", text, differences)
+    write_text, suffix = FORMATS[to]
+    text, differences = write_text(mechanism, **options)
+    return Exported(re.sub(r"[^\w.-]+", "_", mechanism.name) + suffix, text, differences)
 
 
 def write(exported: Exported, folder: Path, overwrite: bool = False) -> Path:

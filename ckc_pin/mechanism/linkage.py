@@ -20,7 +20,7 @@ from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.tree import Tree
 from ckc_pin.mechanism.urdf import TreeText, merge
 
-__all__ = ["Linkage"]
+__all__ = ["Linkage", "tree_texts"]
 
 MAX_OFFSET_M = 1e100  # products of squares of larger lengths overflow
 
@@ -68,7 +68,7 @@ class Linkage:
         overrides: Overrides | None = None,
         prescribed: Mapping[str, float] | None = None,
     ) -> None:
-        text, urdf = merge(_tree_texts(spec, sources))
+        text, urdf = merge(tree_texts(spec, sources))
         self.warnings = list(urdf.warnings)
         if overrides:
             spec, warnings = changed(spec, urdf.root, overrides, sources.name)
@@ -103,7 +103,8 @@ class Linkage:
         self.warnings += self.joints.warnings
 
 
-def _tree_texts(spec: MechanismSpec, sources: Sources) -> list[TreeText]:
+def tree_texts(spec: MechanismSpec, sources: Sources) -> list[TreeText]:
+    """Return the texts of a mechanism's URDFs (InputError if the file names none, or both ways)."""
     if (spec.urdf is None) == (not spec.tree):
         raise InputError(f'{sources.name}: give either urdf = "FILE" or [[tree]] entries')
     if spec.urdf is not None:

@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
+from ckc_pin.formats.loop_frames import place_in_plane
 from ckc_pin.mechanism.couplings import coefficients_of, coupling_name
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.spec import FrameSpec, LoopSpec
 
-__all__ = ["DEFAULT_TIME_STEP_S", "place_in_plane", "to_mjcf"]
+__all__ = ["DEFAULT_TIME_STEP_S", "to_mjcf"]
 
 DEFAULT_TIME_STEP_S = 1e-3
 SOLREF_STEPS = 2  # time constant of the loops in time steps, the shortest that MuJoCo's manual allows
@@ -278,7 +279,7 @@ def _add_loops(mechanism: Mechanism, root: Element, sites: _Sites) -> list[str]:
                 f"loop {loop.name}: the hinge is two points of its axis in MuJoCo, {mechanism.size:.3g} m apart"
             )
         elif loop.type == "point_2d":
-            _add_equality(equality, "connect", loop.name, sites, a, place_in_plane(mechanism, loop, a, b))
+            _add_equality(equality, "connect", loop.name, sites, a, place_in_plane(mechanism, loop, a, b, "MuJoCo"))
             notes.append(f"loop {loop.name}: MuJoCo constrains all three components of the point")
         elif loop.type == "distance":
             _add_distance(mechanism, loop, a, b, equality, tendon, sites)
@@ -328,32 +329,6 @@ def _add_hinge(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame, equalit
 def _shifted(frame: Frame, offset: Array) -> Frame:
     """Return a frame shifted by an offset in its own axes."""
     return Frame(frame.joint, frame.rotation, frame.translation + frame.rotation @ offset)
-
-
-def place_in_plane(mechanism: Mechanism, loop: LoopSpec, a: Frame, b: Frame) -> Frame:
-    """Return frame B of a `point_2d` shifted along the normal into frame A's plane.
-
-    Raises
-    ------
-    InputError
-        The loop leaves the plane, so the offset along the normal is not constant.
-    """
-    tree, random = mechanism.tree, np.random.default_rng(1)
-    axis = np.array(loop.axis_a) / np.linalg.norm(loop.axis_a)
-    joints, points = np.array([a.joint, b.joint], np.intp), np.array([a.translation, b.translation])
-    anchors = Anchors(joints, points, np.zeros(0, np.intp), np.zeros((0, 3)))
-    offsets, normals_in_b = [], []
-    for step in [np.zeros(tree.n), *random.normal(size=(PLANE_CONFIGURATIONS, tree.n))]:
-        pose = Pose(tree, anchors, tree.integrate(mechanism.q_tree, step))
-        normal = axis if loop.rows_in == "world" else pose.rotation[a.joint] @ a.rotation @ axis
-        offsets.append(normal @ pose.r[0])
-        normals_in_b.append(pose.rotation[b.joint].T @ normal)
-    if max(np.ptp(offsets), np.ptp(normals_in_b, axis=0).max()) > PLANE_TOLERANCE * mechanism.size:
-        raise InputError(
-            f"{mechanism.name}: loop {loop.name!r}: MuJoCo has no equality constraint for a point_2d whose frames "
-            "leave the plane"
-        )
-    return Frame(b.joint, b.rotation, b.translation + offsets[0] * normals_in_b[0])
 
 
 def _add_distance(

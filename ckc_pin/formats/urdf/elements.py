@@ -15,6 +15,7 @@ from ckc_pin.formats.conversion import from_rpy, round_number, to_rpy
 from ckc_pin.formats.robot import UNLIMITED, Body, JointAxis
 
 __all__ = [
+    "INERTIA_ENTRIES",
     "add_inertial",
     "add_joint",
     "add_link",

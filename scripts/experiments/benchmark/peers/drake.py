@@ -13,7 +13,7 @@ import numpy as np
 from ckc_pin.analysis.precision.motion import FixedStepProgram, Motion
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
-from ckc_pin.formats.mjcf.writer import place_in_plane
+from ckc_pin.formats.loop_frames import place_in_plane
 from ckc_pin.mechanism.couplings import coefficients_of, coupling_name, curve_of
 from ckc_pin.mechanism.frames import Frame
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -192,7 +192,7 @@ class _Plant:
         mechanism, plant = self.mechanism, self.plant
         for loop in mechanism.spec.loop:
             a, b = (mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
-            b = place_in_plane(mechanism, loop, a, b) if loop.type == "point_2d" else b
+            b = place_in_plane(mechanism, loop, a, b, "Drake") if loop.type == "point_2d" else b
             first, second = self._bodies[a.joint], self._bodies[b.joint]
             if loop.type == "weld":
                 plant.AddWeldConstraint(first, _placed(a), second, _placed(b))
@@ -220,7 +220,7 @@ class _Plant:
         ones, none = np.ones(3), np.zeros(3)
         for loop in self.mechanism.spec.loop:
             a, b = (self.mechanism.frames.find(frame, f"loop {loop.name!r}") for frame in (loop.frame_a, loop.frame_b))
-            b = place_in_plane(self.mechanism, loop, a, b) if loop.type == "point_2d" else b
+            b = place_in_plane(self.mechanism, loop, a, b, "Drake") if loop.type == "point_2d" else b
             ends = [
                 self.plant.AddFrame(
                     FixedOffsetFrame(f"{loop.name} {side}", self._bodies[frame.joint].body_frame(), _placed(frame))
