@@ -155,7 +155,7 @@ def test_loops_of_each_type_allow_the_same_motions(
 
 
 @pytest.mark.parametrize("to", ["urdf", "sdf"])
-def test_what_a_format_lacks_is_refused_or_said(to: str, tmp_path: Path) -> None:
+def test_unsupported_parts_are_refused_or_listed(to: str, tmp_path: Path) -> None:
     mechanism = Mechanism.from_urdf(SPATIAL["s.urdf"])
     curved = Mechanism.from_urdf(SPATIAL["s.urdf"], couplings=[{"joint": "a", "other": "w", "polynomial": [0, 1, 0.5]}])
     with pytest.raises(InputError, match="has linear couplings only"):
