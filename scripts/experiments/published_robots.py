@@ -1,9 +1,10 @@
-"""Make the tables of docs/published_robots.md: `ckc import`, `ckc check` and a motion of published robots.
+"""Make the tables of docs/published_robots.md: `ckc import`, `ckc check`, a motion, and MuJoCo's masses.
 
     ./scripts/experiment robots FOLDER
 
-FOLDER holds a checkout of each repository below, in a folder of the repository's name, at the commit listed here.
-Robots of example-robot-data come from its package (pip install example-robot-data). A missing robot stops the script.
+published_robots.toml lists the repositories with their commits and files. FOLDER holds a checkout of each of them at that
+commit, in a folder OWNER+NAME. Robots of example-robot-data come from its package (pip install example-robot-data). A
+missing file stops the script.
 """
 
 from __future__ import annotations
@@ -11,123 +12,85 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 import ckc_pin
 from ckc_pin.base.sources import resolve_path
-from ckc_pin.formats.importing import read, write
+from ckc_pin.formats.importing import Draft, read, write
 from scripts.experiments.published_robots_motion import measure_reproduction_error
+from scripts.experiments.published_robots_peers import compare_masses
 
 PACKAGE = "package://example-robot-data/robots"
+LIST = Path(__file__).with_name("published_robots.toml")
+COLUMNS = ("robot", "format", "closed", "motors", "n", "rows", "rank", "d", "by file", "kg", "D'", "back", "remarks")
 
 
-@dataclass(frozen=True)
-class Origin:
-    """A repository of robots: its name, its commit and the files to import."""
+class Description(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A file to import, and how many freedoms it means, if that is known from elsewhere."""
 
-    title: str
+    path: str
+    format: str
+    freedoms: int | None = None
+
+
+class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A repository of robots, its commit and its files."""
+
+    repository: str
     commit: str
-    files: tuple[str, ...]
-
-    @property
-    def folder(self) -> str:
-        return self.title.rpartition("/")[2]
+    robot: list[Description]
 
 
-PARALLEL_ROBOTS = (
-    "5bar_linkage 5bar_linkage_iso3d 5bar_linkage_iso6d battobot_6d cassie_like digit_like digit_like_2legs "
-    "digit_like_2legs_6D disney_like disney_robot kangaroo_like kangaroo_like_2legs robot_delta talos_like "
-    "true_talos_2_legs wl16_like"
-)
+class Robots(msgspec.Struct, frozen=True):
+    """Content of published_robots.toml."""
 
-ORIGINS = (
-    Origin(
-        "Gepetto/example-parallel-robots",
-        "52e64b31",
-        tuple(f"robots/{name}/robot.yaml" for name in PARALLEL_ROBOTS.split()),
-    ),
-    Origin(
-        "ROAM-Lab-ND/generalized_rbda",
-        "45fa7c46",
-        (
-            *(f"robot-models/{name}.urdf" for name in ("four_bar", "six_bar", "planar_leg_linkage")),
-            *(f"robot-models/{name}.urdf" for name in ("mini_cheetah", "mit_humanoid", "jvrc1_humanoid")),
-            "Benchmarking/urdfs/parallel_chains/Implicit/depth5/loop_size5.urdf",
-        ),
-    ),
-    Origin(
-        "Rhoban/placo-examples",
-        "3edf600f",
-        (
-            *(f"models/{name}/robot.urdf" for name in ("planar-2dof", "orbita", "megabot", "spm")),
-            "models/spm/robot.xml",
-        ),
-    ),
-    Origin(
-        "Rhoban/onshape-to-robot-examples",
-        "a0f8b921",
-        ("planar-2dof/robot.xml", "orbita_mujoco/robot.xml"),
-    ),
-    Origin("osudrl/cassie-mujoco-sim", "188d3d7f", ("model/cassie.xml",)),
-    Origin(
-        "kevinzakka/mink",
-        "cf1a302f",
-        tuple(f"examples/{name}.xml" for name in ("ufactory_xarm7/xarm7", "stanford_tidybot/tidybot", "aloha/aloha")),
-    ),
-    Origin(
-        "google-deepmind/mujoco_playground",
-        "d5e6b475",
-        tuple(
-            f"mujoco_playground/_src/manipulation/{name}.xml"
-            for name in ("franka_emika_panda_robotiq/xmls/panda_updated_robotiq_2f85", "aero_hand/xmls/right_hand")
-        ),
-    ),
-    Origin(
-        "google-deepmind/mujoco",
-        "a7255075",
-        tuple(
-            f"test/engine/testdata/{name}.xml"
-            for name in ("core_constraint/jdotv_connect_2d", "core_constraint/jdotv_weld_3d", "armature_equivalence")
-        ),
-    ),
-    Origin(
-        "example-robot-data",
-        "package 6.0.0",
-        (
-            "talos_data/robots/talos_full_v2.urdf",
-            "romeo_description/urdf/romeo.urdf",
-            "tiago_pro_description/robots/tiago_pro.urdf",
-            "pr2_description/urdf/pr2.urdf",
-            "panda_description/urdf/panda.urdf",
-            "alex_description/urdf/alex_psyonic_hands.urdf",
-        ),
-    ),
-)
+    origin: list[Origin]
 
 
-def row(name: str, path: Path) -> str:
+def row(name: str, path: Path, description: Description) -> str:
     """Import, check and move one robot; return its line of the table."""
-    draft = read(path)
+    by_file = "" if description.freedoms is None else str(description.freedoms)
+    try:
+        draft = read(path)
+    except ckc_pin.CkcError as error:
+        return _line(name, description.format, "refused", *[""] * 5, by_file, *[""] * 3, _shorten(error, path))
     motors = str(len(draft.actuated)) if draft.actuated else ""
     joints = [spec for spec, _ in draft.joints]
     counts = {"rotor": sum(spec.armature is not None for spec in joints), "stop": sum(spec.stops for spec in joints)}
     counted = [f"{count} {what}{'s' * (count > 1)}" for what, count in counts.items() if count]
     remarks = counted + _remarks([*draft.guessed, *draft.left_out])
     with tempfile.TemporaryDirectory() as folder:
-        file, _ = write(draft, Path(folder))
+        file = write(draft, Path(folder))[0]
         try:
             checked = ckc_pin.check(file)
         except ckc_pin.MechanismError as error:
             what = str(error).partition("mechanism.toml: ")[2].partition(". Check")[0]
-            return _line(name, "yes", "no", motors, *[""] * 6, "; ".join([*remarks, what]))
+            return _line(
+                name, description.format, "no", motors, *[""] * 4, by_file, *[""] * 3, "; ".join([*remarks, what])
+            )
+        masses = _format(compare_masses(ckc_pin.load(file), path))
+    numbers = [str(x) for x in (checked.n, checked.rows, checked.rank, checked.d)]
+    back = _measure_back(draft, path)
+    said = "; ".join([*remarks, *_remarks(checked.warnings)])
+    return _line(name, description.format, "yes", motors, *numbers, by_file, f"{checked.mass:.4g}", masses, back, said)
+
+
+def _measure_back(draft: Draft, path: Path) -> str:
     try:
-        back = f"{measure_reproduction_error(draft):.0e}"
+        return _format(measure_reproduction_error(draft))
     except ckc_pin.CkcError as error:
         print(f"{path}: {error}", file=sys.stderr)
-        back = "none"
-    numbers = (*(str(x) for x in (checked.n, checked.rows, checked.rank, checked.d)), f"{checked.mass:.4g}", back)
-    return _line(name, "yes", "yes", motors, *numbers, "; ".join([*remarks, *_remarks(checked.warnings)]))
+        return "none"
+
+
+def _format(error: float | None) -> str:
+    return "" if error is None else f"{error:.0e}"
+
+
+def _shorten(error: Exception, path: Path) -> str:
+    return " ".join(str(error).replace(f"{path}: ", "").replace(str(path.parent), "").split())
 
 
 # Part of a note or warning -> its short form. {n}: number of names after the colon; {m}: number of names before it;
@@ -169,14 +132,16 @@ def _line(*cells: str) -> str:
 
 def main(root: Path) -> None:
     """Print the tables of all robots under a folder."""
-    for origin in ORIGINS:
-        print(f"\n## {origin.title} ({origin.commit})\n")
-        print(_line("robot", "imported", "closed", "motors", "n", "rows", "rank", "d", "kg", "back", "remarks"))
-        print(_line(*["---"] * 11))
-        for file in origin.files:
-            named = origin.title == "example-robot-data"
-            path = resolve_path(f"{PACKAGE}/{file}", Path(), file) if named else root / origin.folder / file
+    for origin in msgspec.toml.decode(LIST.read_bytes(), type=Robots).origin:
+        print(f"\n## {origin.repository} ({origin.commit[:8]})\n")
+        print(_line(*COLUMNS))
+        print(_line(*["---"] * len(COLUMNS)))
+        for description in origin.robot:
+            if origin.repository == "example-robot-data":
+                path = resolve_path(f"{PACKAGE}/{description.path}", Path(), description.path)
+            else:
+                path = root / origin.repository.replace("/", "+") / description.path
             if not path.is_file():
                 raise FileNotFoundError(f"{path}: not there")
-            stem = path.parent.name if path.stem == "robot" else path.stem
-            print(row(f"{stem}{'' if path.suffix != '.xml' else ' (MJCF)'}", path), flush=True)
+            stem = path.parent.name if path.stem in ("robot", "model", "scene") else path.stem
+            print(row(stem, path, description), flush=True)
