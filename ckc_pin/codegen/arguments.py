@@ -45,6 +45,7 @@ def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list
         "centre": lambda j, k: f"link.{links[j]}.com.{entry(k)}",
         "inertia": lambda j, k, m: f"link.{links[j]}.inertia.i{entry(k)}{entry(m)}",
         "armature": lambda k: f"joint.{tree.coordinates[k]}.armature",
+        "rotors": lambda k, j: f"rotors.{tree.coordinates[k]}.{tree.coordinates[j]}",
         "point": lambda k, i: f"{points[k]}.xyz.{entry(i)}",
         "length": lambda row: f"loop.{rows[row]}",
         "affine": lambda row, k: f"{rows[row]}.{tree.coordinates[k]}",

@@ -100,7 +100,7 @@ def term_expressions(
     gravity = arguments.column("gravity")
     q_dot = _configuration_rate(mechanism, q, v)
     D_tree, bias, potential = _inertia(mechanism, bodies, gravity, arguments)
-    rotor_forces = multiply(cs.diag(_armature(tree.n, arguments)), v_dot)
+    rotor_forces = multiply(_rotors(tree.n, arguments), v_dot)
     inverse_dynamics = _inertia(mechanism, accelerated, gravity, arguments)[1] + rotor_forces
     elastic, damping, stored = _springs(mechanism, bodies, q, v, arguments)
     rows = row_terms(mechanism.closure, bodies, configuration, v, q_dot, tree.q_index.tolist(), arguments)
@@ -178,13 +178,21 @@ def _inertia(
             second[parent] = second[parent] + second[k] + _shift_second_moments(d, first[k] + mass[k] / 2 * d)
             first[parent] = first[parent] + first[k] + mass[k] * d
             mass[parent] = mass[parent] + mass[k]
-    return cs.sparsify(D + cs.diag(_armature(n, arguments))), bias, potential
+    return cs.sparsify(D + _rotors(n, arguments)), bias, potential
 
 
-def _armature(n: int, arguments: Arguments) -> Any:
+def _rotors(n: int, arguments: Arguments) -> Any:
+    """Return what armatures and rotors of motors on several joints add to D', (n, n)."""
     import casadi as cs
 
-    return cs.vertcat(*(arguments.number("armature", k) for k in range(n)))
+    inertia = cs.diag(cs.vertcat(*(arguments.number("armature", k) for k in range(n))))
+    for name, index in arguments.places:
+        if name == "rotors":
+            i, j = index
+            inertia[i, j] += arguments.number("rotors", i, j)
+            if i != j:
+                inertia[j, i] = inertia[i, j]
+    return inertia
 
 
 def _rotate_symmetric(I: Any, R: Any) -> Any:

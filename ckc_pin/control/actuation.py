@@ -11,11 +11,12 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.base.validation import is_number, suggest_name
-from ckc_pin.control.spec import AllocationSpec, Limit
+from ckc_pin.control.spec import AllocationSpec, TorqueLimit
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.motors import torque_limits
 
 __all__ = ["Actuation", "Effort", "require_tau", "require_u"]
 
@@ -99,8 +100,8 @@ class Actuation:
     Parameters
     ----------
     mechanism : Mechanism
-    torque_limit : number or {motor: number}, optional
-        Limit of |tau|, N m or N, in addition to the motors' own limits.
+    torque_limit : number, (lower, upper) or {motor: either}, optional
+        Limit of |tau|, or both limits of tau, N m or N, in addition to the motors' own limits.
     allocation : AllocationSpec, optional
         Weights and preload of redundant motors; default: minimum-norm torques.
 
@@ -108,8 +109,8 @@ class Actuation:
     ----------
     is_direct : bool
         Whether each motor drives one independent coordinate, in order and without gear: tau = u.
-    scene_limit, limit : (motors,) array
-        `torque_limit` alone, and with the motors' own limits; infinite where there is none.
+    scene_limit, limit : (2, motors) array
+        Lower and upper limits: of `torque_limit` alone, and with the motors' own limits; infinite where there is none.
     weights, preload : (motors,) array
     zero : Effort
 
@@ -122,15 +123,25 @@ class Actuation:
     def __init__(
         self,
         mechanism: Mechanism,
-        torque_limit: Limit | dict[str, Limit] | None = None,
+        torque_limit: TorqueLimit | dict[str, TorqueLimit] | None = None,
         allocation: AllocationSpec | None = None,
     ) -> None:
         self.mechanism, self.motors = mechanism, mechanism.motors
         motors, count = self.motors, len(self.motors.names)
         self.is_direct = mechanism.has_direct_drives
-        limits = torque_limit if isinstance(torque_limit, dict) else dict.fromkeys(motors.names, torque_limit or np.inf)
-        self.scene_limit = motors.vector(limits, "controller.torque_limit", np.inf)
-        self.limit = np.minimum(self.scene_limit, motors.torque_limit)
+        where = "controller.torque_limit"
+        if isinstance(torque_limit, dict):
+            sides = {name: torque_limits(limit, f"{where}.{name}") for name, limit in torque_limit.items()}
+        else:
+            sides = dict.fromkeys(motors.names, torque_limits(torque_limit, where))
+        lower, upper = ({name: limits[side] for name, limits in sides.items()} for side in (0, 1))
+        self.scene_limit = np.array([motors.vector(lower, where, -np.inf), motors.vector(upper, where, np.inf)])
+        self.limit = np.array(
+            [
+                np.maximum(self.scene_limit[0], motors.torque_limit[0]),
+                np.minimum(self.scene_limit[1], motors.torque_limit[1]),
+            ]
+        )
         allocation = allocation or AllocationSpec()
         self.weights = motors.vector(allocation.weights, "controller.allocation.weights", 1.0)
         self.preload = motors.vector(allocation.preload, "controller.allocation.preload", 0.0)
@@ -189,6 +200,13 @@ class Actuation:
         transmission = (self.motors.transmission @ tangent).T
         return np.asarray(scale * np.linalg.lstsq(transmission * scale, force, rcond=MIN_TRANSMISSION)[0], dtype=float)
 
+    def explain_overload(self, tau: Array) -> str:
+        """Return which motor is furthest beyond its limits at torques tau, (motors,), as part of a message."""
+        limit = np.where(tau < 0.0, self.limit[0], self.limit[1])
+        k = int(np.argmax(np.abs(tau) / np.maximum(np.abs(limit), 1e-300)))
+        sign = 1.0 if self.limit[0, k] == -self.limit[1, k] else np.sign(tau[k])
+        return f"{self.motors.names[k]} would need {sign * abs(tau[k]):.4g}, its limit is {sign * abs(limit[k]):.4g}"
+
     def apply_tau(self, terms: Terms, tau: Any) -> Effort:
         """Return the effort of motor torques, clipped at their limits.
 
@@ -202,6 +220,6 @@ class Actuation:
         tau = require_tau(tau, self.mechanism)
         if not np.isfinite(tau).all():
             raise NumericalError(f"the controller's tau is not finite: {tau.tolist()}")
-        tau = np.clip(tau, -self.limit, self.limit)
+        tau = np.clip(tau, *self.limit)
         u_tree = self.motors.force(tau)
         return Effort(tau, u_tree, terms.rho.T @ u_tree)

@@ -89,7 +89,7 @@ class JointServo:
                 f"controller.motor: a desired rate jumps at t = {jump:.6g} s, where the torque would jump too; use "
                 'profile = "quintic", "cubic" or "trapezoidal"'
             )
-        self._limit = mechanism.motors.torque_limit[self.motors]
+        self._limit = mechanism.motors.torque_limit[:, self.motors]
         self.balance = Actuation(mechanism)
 
     def tau(self, t: float, terms: Terms, state: Array | None = None) -> Array:
@@ -115,7 +115,7 @@ class JointServo:
     def state_dot(self, t: float, terms: Terms, state: Array) -> Array:
         """Return the rates of the integrals, shape (integrals,)."""
         requested = self.tau(t, terms, state)[self.motors]
-        excess = requested - np.clip(requested, -self._limit, self._limit)
+        excess = requested - np.clip(requested, *self._limit)
         rates = -self.K_I * self._errors(t, terms)[0] - self.unwinding * self.gear * excess
         return np.asarray(rates[self.has_integral])
 
@@ -134,15 +134,16 @@ class JointServo:
         return desired
 
     def limit_torques(self, limit: Array) -> None:
-        """Set the torque limits that act on the motors, (motors,), N m or N."""
-        self._limit = limit[self.motors]
+        """Set the lower and upper torque limits that act on the motors, (2, motors), N m or N."""
+        self._limit = limit[:, self.motors]
 
     def servo_tables(self) -> list[dict[str, Any]]:
         """Return the servos for the native core."""
         return [
             {"motor": motor, "joint": joint, "gear": float(self.gear[k]), "of_rate": bool(self.of_rate[k]),
              "K_P": float(self.K_P[k]), "K_I": float(self.K_I[k]), "K_D": float(self.K_D[k]),
-             "limit": float(self._limit[k]), "unwinding": float(self.unwinding[k])}
+             "lower": float(self._limit[0, k]), "upper": float(self._limit[1, k]),
+             "unwinding": float(self.unwinding[k])}
             for k, (motor, joint) in enumerate(zip(self.motors, self.joints, strict=True))
         ]  # fmt: skip
 

@@ -13,6 +13,7 @@ from ckc_pin.base.toml import FileStruct
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.piecewise import Interpolation, Profile
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.spec import Pair
 
 __all__ = [
     "AllocationSpec",
@@ -28,6 +29,7 @@ __all__ = [
     "ServoSpec",
     "SetPointSpec",
     "TableSpec",
+    "TorqueLimit",
     "TorquesSpec",
     "TrackingSpec",
     "Waypoints",
@@ -42,6 +44,7 @@ EIGENVALUE_TOLERANCE = 1e-14  # relative to the largest entry: [[1, 1], [1, 1]] 
 
 Gain = float | dict[str, float] | list[float | list[float]]
 Limit = Annotated[float, msgspec.Meta(gt=0)]
+TorqueLimit = Limit | Pair  # of |tau|, or lower and upper
 Size = Annotated[float, msgspec.Meta(ge=0)]
 
 
@@ -123,11 +126,12 @@ class _ControllerSpec(FileStruct, frozen=True, kw_only=True, tag_field="type"):
     Attributes
     ----------
     torque_limit : N m, N
-        Limit of |tau| in addition to the motors' own limits; a table is by motor, a list in the order of the motors.
-        ``torque_limit = {theta_1 = 30.0, theta_3 = 20.0}``
+        Limit of |tau|, or the smallest and the largest tau as ``[-1.0, 3.0]``, in addition to the motors' own limits. A
+        table is by motor, and a list of limits in the order of the motors.
+        ``torque_limit = {theta_1 = 30.0, theta_3 = [0.0, 20.0]}``
     """
 
-    torque_limit: Limit | dict[str, Limit] | None = None
+    torque_limit: TorqueLimit | dict[str, TorqueLimit] | None = None
 
 
 class _SampledSpec(_ControllerSpec, frozen=True, kw_only=True):

@@ -88,7 +88,7 @@ class Terms(HasSummary):
     @lazy
     def D_tree(self) -> Array:
         """Inertia matrix D' of the tree, shape (n, n)."""
-        return self.mechanism.tree.evaluate(pin.crba, self.q_tree)
+        return self.mechanism.tree.mass_matrix(self.q_tree)
 
     @lazy
     def C_tree(self) -> Array:

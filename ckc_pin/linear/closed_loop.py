@@ -154,7 +154,14 @@ def _ideal_actuation(mechanism: Mechanism) -> dict[str, Any]:
     """Return the table of unlimited motors on the independent coordinates."""
     q, zeros = mechanism.partition.q, np.zeros(mechanism.d)
     turns = np.asfortranarray(np.eye(mechanism.n)[q])
-    return {"transmission": turns, "direct": True, "limit": zeros + np.inf, "weights": zeros + 1.0, "preload": zeros}
+    return {
+        "transmission": turns,
+        "direct": True,
+        "lower": zeros - np.inf,
+        "upper": zeros + np.inf,
+        "weights": zeros + 1.0,
+        "preload": zeros,
+    }
 
 
 @dataclass(frozen=True)
@@ -200,11 +207,7 @@ class LimitedClosedLoop:
             limited = apply_u(actuation, state, u)
             if np.abs(limited.u - u).max() > U_TOLERANCE * np.abs(u).max():
                 tau = actuation.minimum_norm_torques(state.rho, u)
-                k = int(np.argmax(np.abs(tau) / actuation.limit))
-                raise NumericalError(
-                    f"{where} {actuation.motors.names[k]} would need {abs(tau[k]):.4g}, its limit is "
-                    f"{actuation.limit[k]:.4g}"
-                )
+                raise NumericalError(f"{where} {actuation.explain_overload(tau)}")
         return self.closed_loop.linearize(t, state)
 
     def compute_required_u(self, state: Terms, q_ddot: Array) -> Array:

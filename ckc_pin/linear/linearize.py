@@ -385,8 +385,8 @@ def _describe_instant(scene: Scene, run: Run, k: int) -> tuple[str, ...]:
     limits = build_scene_actuation(scene, run.mechanism).limit
     saturated = [
         name
-        for name, tau, limit in zip(run.actuated, run.tau[k], limits, strict=True)
-        if abs(tau) >= limit * (1 - LIMIT_TOLERANCE)
+        for name, tau, (lower, upper) in zip(run.actuated, run.tau[k], limits.T, strict=True)
+        if not lower * (1 - LIMIT_TOLERANCE) < tau < upper * (1 - LIMIT_TOLERANCE)
     ]
     if saturated:
         notes.append(f"at the torque limit, so the controller cannot increase the torque: {', '.join(saturated)}")

@@ -164,7 +164,7 @@ def _balance_along(state: Terms, tangent: Array, actuation: Actuation, *, has_fr
             state,
             tangent,
             np.vstack([turns, np.eye(mechanism.n)[rubbing]]),
-            np.concatenate([actuation.limit, max_friction[rubbing]]),
+            np.hstack([actuation.limit, [-max_friction[rubbing], max_friction[rubbing]]]),
             np.concatenate([actuation.weights, np.ones(len(rubbing))]),
             np.concatenate([actuation.preload, np.zeros(len(rubbing))]),
         )
@@ -185,14 +185,10 @@ def _allocate_along(state: Terms, tangent: Array, turns: Array, limit: Array, we
 def _explain_imbalance(state: Terms, tangent: Array, actuation: Actuation) -> str:
     mechanism, names = state.mechanism, state.mechanism.actuated
     unlimited = actuation.minimum_norm_torques(tangent, tangent.T @ state.h_tree)
-    load = np.abs(unlimited) / np.maximum(actuation.limit, 1e-300)
     motors = f"the motor{'s' if len(names) > 1 else ''} ({', '.join(names)})"
     if not has_unbalanced_force(state, mechanism.motors.force(unlimited), tangent):
-        k = int(np.argmax(load))
-        return (
-            f"{motors} cannot hold this configuration within the torque limits: {names[k]} would need "
-            f"{abs(unlimited[k]):.4g}, its limit is {actuation.limit[k]:.4g}"
-        )
+        overload = actuation.explain_overload(unlimited)
+        return f"{motors} cannot hold this configuration within the torque limits: {overload}"
     freedoms = _name_undriven_freedoms(mechanism, tangent)
     if not names:
         return (

@@ -13,7 +13,7 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.spec import MechanismSpec, MotorSpec
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["Motors", "motors_of"]
+__all__ = ["Motors", "motors_of", "torque_limits"]
 
 
 class Motors:
@@ -26,8 +26,10 @@ class Motors:
     names : sequence of str
     transmission : (m, n) array
         Shaft rates by joint rates: the gear ratios.
-    torque_limit, speed_limit : (m,) array
-        At the shaft, N m or N, and rad/s or m/s; infinite if there is no limit.
+    torque_limit : (2, m) array
+        Lower and upper limits at the shaft, N m or N; infinite if there is no limit.
+    speed_limit : (m,) array
+        At the shaft, rad/s or m/s; infinite if there is no limit.
     key : str
         Key of the mechanism file that lists them, for messages.
 
@@ -64,7 +66,7 @@ class Motors:
         if of_root:
             raise MechanismError(f"actuated: {of_root[0]!r} belongs to a free root, which has no motor")
         unlimited = np.full(len(at), np.inf)
-        return cls(joints, np.eye(tree.n)[at], unlimited, unlimited, "actuated")
+        return cls(joints, np.eye(tree.n)[at], np.array([-unlimited, unlimited]), unlimited, "actuated")
 
     def with_joints(self, tree: Tree, joints: Sequence[str]) -> Motors:
         """Return these motors and one more, without gear and limits, for each joint that none of them drives alone."""
@@ -75,7 +77,7 @@ class Motors:
         return Motors(
             (*self.names, *others.names),
             np.vstack([self.transmission, others.transmission]),
-            np.concatenate([self.torque_limit, others.torque_limit]),
+            np.concatenate([self.torque_limit, others.torque_limit], axis=1),
             np.concatenate([self.speed_limit, others.speed_limit]),
             self.key,
         )
@@ -119,8 +121,8 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
     Raises
     ------
     InputError, MechanismError
-        Both `actuated` and `motor` are given, a motor has no joint, a gear ratio is zero, or a motor on several joints
-        has a rotor inertia.
+        Both `actuated` and `motor` are given, a motor has no joint, a gear ratio is zero, or an inertia or a torque
+        limit is not possible.
     """
     if spec.actuated is not None and spec.motor:
         raise MechanismError("actuated, motor: give one of them; actuated stands for motors without a gear")
@@ -129,7 +131,7 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
     if not spec.motor:
         return None
     transmission, armature = np.zeros((len(spec.motor), tree.n)), np.array(tree.model.armature)
-    names = []
+    names, rotors = [], np.zeros((tree.n, tree.n))
     for k, motor in enumerate(spec.motor):
         names.append(_motor_name(motor, k))
         where = f"motor {names[k]!r}"
@@ -137,22 +139,49 @@ def motors_of(spec: MechanismSpec, tree: Tree) -> Motors | None:
             transmission[k, tree.joint_index(joint, where)] = motor.ratio * share
         if not transmission[k].any():
             raise MechanismError(f"{where}: its gear turns no joint; give a ratio other than 0")
-        if motor.rotor_inertia and np.count_nonzero(transmission[k]) > 1:
-            raise MechanismError(
-                f"{where}: rotor_inertia goes with a motor on one joint; on several it would couple their inertias. "
-                "Leave it out, or give the joints an armature"
-            )
         if motor.rotor_inertia:
             with np.errstate(over="ignore"):
-                armature += transmission[k] ** 2 * motor.rotor_inertia
-            if not np.all(np.isfinite(armature)):
+                if np.count_nonzero(transmission[k]) > 1:
+                    rotors += motor.rotor_inertia * np.outer(transmission[k], transmission[k])
+                else:
+                    armature += transmission[k] ** 2 * motor.rotor_inertia
+            if not np.all(np.isfinite(armature)) or not np.all(np.isfinite(rotors)):
                 raise MechanismError(
                     f"{where}: ratio = {motor.ratio:g} with rotor_inertia = {motor.rotor_inertia:g} is too large: the "
                     "inertia at the joint is not finite"
                 )
-    tree.model.armature = armature
-    limits = np.array([(m.torque_limit or np.inf, m.speed_limit or np.inf) for m in spec.motor])
-    return Motors(names, transmission, limits[:, 0], limits[:, 1])
+    tree.model.armature, tree.rotors = armature, rotors
+    limits = [
+        torque_limits(m.torque_limit, f"motor {name!r}: torque_limit")
+        for name, m in zip(names, spec.motor, strict=True)
+    ]
+    speeds = np.array([m.speed_limit or np.inf for m in spec.motor])
+    return Motors(names, transmission, np.array(limits).T, speeds)
+
+
+def torque_limits(limit: float | Sequence[float] | None, where: str) -> tuple[float, float]:
+    """Return the lower and the upper limit of a torque, which are infinite if there is none.
+
+    Parameters
+    ----------
+    limit : float or pair of float, optional
+        Largest |tau|, or both limits.
+    where : str
+        Prefix of the error message.
+
+    Raises
+    ------
+    InputError
+        Zero is not within the limits, or both limits are zero.
+    """
+    if limit is None or isinstance(limit, float | int):
+        size = np.inf if limit is None else float(limit)
+        return -size, size
+    lower, upper = limit
+    if not lower <= 0.0 <= upper or lower == upper:
+        raise InputError(f"{where}: expected a lower limit of at most 0 and an upper one of at least 0, "
+                             f"got [{lower:g}, {upper:g}]")  # fmt: skip
+    return lower, upper
 
 
 def _motor_name(motor: MotorSpec, k: int) -> str:

@@ -51,7 +51,8 @@ def model_numbers(mechanism: Mechanism) -> dict[str, Array]:
     """Return the numbers of a mechanism's model, in SI units.
 
     Keys and shapes: gravity (3); by joint, the world's first, offset and centre (joints, 3), mass (joints) and inertia
-    about the centre (joints, 3, 3); armature (n); by loop frame point (frames, 3); by row length and affine_offset
+    about the centre (joints, 3, 3); armature (n); rotors (n, n), the upper triangle of what rotors of
+    motors on several joints add to D'; by loop frame point (frames, 3); by row length and affine_offset
     (rows), affine (rows, n); by coordinate constant, joint_stiffness, joint_rest, joint_damping (n); by spring end
     (2 springs, 3), stiffness, rest_length, damping (springs).
     """
@@ -70,6 +71,7 @@ def model_numbers(mechanism: Mechanism) -> dict[str, Array]:
         "centre": np.array([inertia.lever * (inertia.mass > 0) for inertia in model.inertias]),
         "inertia": np.array([inertia.inertia for inertia in model.inertias]),
         "armature": np.array(model.armature),
+        "rotors": np.triu(mechanism.tree.rotors),
         "point": np.reshape(closure.anchors.point_local, (-1, 3)),
         "length": length,
         "affine": affine,
@@ -91,7 +93,7 @@ class ParameterMap:
     Beside those of `model_numbers`: by joint rotation (joints, 3, 3) of its placement, and of its body about the
     joint's origin moment = mass * centre (joints, 3) and origin_inertia (joints, 3, 3); by loop frame
     point_rotation (frames, 3, 3); reported (points, 3), the mechanism's named points; friction, restitution, lower,
-    upper (n); by motor torque_limit (m) and transmission (m, n).
+    upper (n); by motor torque_limit (2, m) and transmission (m, n).
 
     Parameters
     ----------
@@ -271,15 +273,20 @@ class _Members:
         number = self.mechanism.motors.names.index(carrier)
         motor, gear = self.mechanism.spec.motor[number], self.mechanism.motors.transmission[number]
         ratio = self.member_values.get(f"motor.{carrier}.ratio", motor.ratio)
-        inertia = self.member_values.get(f"motor.{carrier}.rotor_inertia", motor.rotor_inertia or 0.0)
-        if key == "torque_limit":
-            self._set("torque_limit", number, column)
-        elif key == "ratio":
+        inertia = self.member_values.get(f"motor.{carrier}.rotor_inertia", motor.rotor_inertia)
+        if key in ("torque_limit", "torque_limit.lower"):
+            self._set("torque_limit", (0, number), column if key.endswith("lower") else -column)
+        if key in ("torque_limit", "torque_limit.upper"):
+            self._set("torque_limit", (1, number), column)
+        if key == "ratio":
             self._set("transmission", number, gear * (column / motor.ratio)[:, None])
         if key == "rotor_inertia" or (key == "ratio" and f"motor.{carrier}.rotor_inertia" not in self.member_values):
-            for at in map(int, np.flatnonzero(gear)):
-                step = (gear[at] * ratio / motor.ratio) ** 2 * inertia - gear[at] ** 2 * (motor.rotor_inertia or 0.0)
-                self._increase("armature", at, step)
+            step: Numbers = np.asarray((ratio / motor.ratio) ** 2 * inertia - motor.rotor_inertia)
+            driven = [int(at) for at in np.flatnonzero(gear)]
+            if len(driven) == 1:
+                self._increase("armature", driven[0], gear[driven[0]] ** 2 * step)
+            else:
+                self._array("rotors")[:] += np.triu(np.outer(gear, gear)) * step[:, None, None]
 
     def _set(self, key: str, at: Any, column: Numbers) -> None:
         where = at if isinstance(at, tuple) else (at,)

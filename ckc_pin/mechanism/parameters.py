@@ -39,6 +39,7 @@ Overrides = Mapping[str, Value]
 
 ROOTS = ("gravity", "link", "joint", "loop", "coupling", "spring", "force", "motor")
 AXES = "xyz"
+SIDES = ("lower", "upper")  # of a torque limit with two sides
 OF_JOINT = ("armature", "damping", "friction", "restitution")  # keys of [[joint]]
 OF_LINK = ("mass", "com", *(f"inertia.{entry}" for entry in INERTIA))
 INERTIA_ENTRIES = {entry: ("xyz".index(entry[1]), "xyz".index(entry[2])) for entry in INERTIA}  # rows and columns
@@ -49,7 +50,7 @@ OF_ENTRY = {
     "coupling": ("ratio", "offset", "joints"),
     "spring": ("stiffness", "damping", "rest_length", "rest", "frame_a.xyz", "frame_b.xyz"),
     "force": ("value",),
-    "motor": ("ratio", "rotor_inertia", "torque_limit", "speed_limit"),
+    "motor": ("ratio", "rotor_inertia", "torque_limit", "torque_limit.lower", "torque_limit.upper", "speed_limit"),
 }  # keys of the file's other tables
 
 
@@ -247,7 +248,10 @@ def _of_file(spec: MechanismSpec) -> Iterator[tuple[str, Value]]:
         for k, entry in enumerate(data[kind]):
             for key in keys:
                 table, _, last = key.rpartition(".")
-                if table:
+                if table == "torque_limit":
+                    if not isinstance(entry[table], float | None):
+                        yield f"{kind}.{_called(kind, k, entry)}.{key}", float(entry[table][SIDES.index(last)])
+                elif table:
                     frame = entry.get(table)
                     if frame is not None:
                         at = (0.0, 0.0, 0.0) if isinstance(frame, str) else frame[last]
@@ -264,7 +268,7 @@ def _has(kind: str, entry: Mapping[str, Any], key: str) -> bool:
     if kind == "spring":
         on_joint = entry["joint"] is not None
         return key in ("stiffness", "damping") or key == ("rest" if on_joint else "rest_length")
-    return entry[key] is not None
+    return isinstance(entry[key], int | float)
 
 
 def _called(kind: str, k: int, entry: Mapping[str, Any]) -> str:
@@ -356,6 +360,9 @@ def _change_entry(kind: str, entries: list[dict[str, Any]], carrier: str, key: s
     table, _, last = key.partition(".")
     if not last:
         entry[key] = value
+        return
+    if table == "torque_limit":
+        entry[table][SIDES.index(last)] = value
         return
     if isinstance(entry[table], str):
         entry[table] = {"link": entry[table]}

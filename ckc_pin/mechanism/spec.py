@@ -25,6 +25,7 @@ __all__ = [
     "MotorSpec",
     "Name",
     "NonNegative",
+    "Pair",
     "PointSpec",
     "Positive",
     "SpringSpec",
@@ -34,6 +35,8 @@ __all__ = [
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+# Not a tuple: msgspec 0.22 reads beyond its arrays if a constrained number or a tuple of fixed length is allowed.
+Pair = Annotated[list[float], msgspec.Meta(min_length=2, max_length=2)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Name = Annotated[str, msgspec.Meta(min_length=1)]
 
@@ -222,11 +225,12 @@ class MotorSpec(FileStruct, frozen=True):
         Gear ratio, with its sign; not 0.
         ``ratio = 50.0``
     rotor_inertia : kg m², kg
-        Inertia of the rotor; ratio² times it is added to the armature of the joint. For a motor on one joint.
+        Inertia of the rotor; ratio² times it is added to the armature of the joint. Of a motor on several joints with
+        weights w, ratio² rotor_inertia w wᵀ is added to D'.
         ``rotor_inertia = 1.2e-5``
     torque_limit : N m, N
-        Largest |tau|.
-        ``torque_limit = 0.6``
+        Largest |tau|, or the smallest and the largest tau, of which one may be 0.
+        ``torque_limit = [-1.0, 3.0]``
     speed_limit : rad/s, m/s
         Largest speed of the motor. A run reports where it is exceeded, but does not enforce it.
         ``speed_limit = 300.0``
@@ -237,7 +241,7 @@ class MotorSpec(FileStruct, frozen=True):
     joints: dict[str, float] = {}
     ratio: float = 1.0
     rotor_inertia: NonNegative = 0.0
-    torque_limit: Positive | None = None
+    torque_limit: Positive | Pair | None = None
     speed_limit: Positive | None = None
 
 

@@ -71,6 +71,8 @@ class Tree:
         1 where a coordinate moves a joint, otherwise 0.
     parent_joint : (n,) int array
         Joint that carries the joint of each coordinate.
+    rotors : (n, n) array
+        What rotors of motors on several joints add to D'.
 
     Raises
     ------
@@ -95,6 +97,7 @@ class Tree:
         self.step_scale = np.where(self.in_metres, size, 1.0)
         self._q_scale = np.ones(self.nq)
         self._q_scale[self.q_index] = self.step_scale
+        self.rotors = np.zeros((self.n, self.n))
         self.support = np.zeros((model.njoints, 1, self.n))
         parents = list(model.parents)
         self.parent_joint = np.zeros(self.n, dtype=np.intp)
@@ -157,6 +160,10 @@ class Tree:
         """Call an algorithm of Pinocchio, (model, data, *state), and return a copy of its result."""
         with self.lock:
             return np.array(algorithm(self.model, self.data, *state))
+
+    def mass_matrix(self, q_tree: Array) -> Array:
+        """Return D' with all rotors, shape (n, n)."""
+        return self.evaluate(pin.crba, q_tree) + self.rotors
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""

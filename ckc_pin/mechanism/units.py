@@ -54,7 +54,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
     if root == "motor":
         unit = _shafts(mechanism)[mechanism.motors.names.index(carrier)]
         of_motor = {"rotor_inertia": ROTOR[unit], "torque_limit": effort(unit), "speed_limit": f"{unit}/s"}
-        return of_motor.get(key, "")
+        return of_motor.get(key.partition(".")[0], "")
     return _of_coordinate(mechanism, root, carrier, key)
 
 

@@ -193,31 +193,33 @@ class CoreParameter(enum.Enum):
 
     ARMATURE = 5
 
-    POINT = 6
+    ROTORS = 6
 
-    LENGTH = 7
+    POINT = 7
 
-    AFFINE = 8
+    LENGTH = 8
 
-    AFFINE_OFFSET = 9
+    AFFINE = 9
 
-    END = 10
+    AFFINE_OFFSET = 10
 
-    STIFFNESS = 11
+    END = 11
 
-    REST_LENGTH = 12
+    STIFFNESS = 12
 
-    DAMPING = 13
+    REST_LENGTH = 13
 
-    JOINT_STIFFNESS = 14
+    DAMPING = 14
 
-    JOINT_REST = 15
+    JOINT_STIFFNESS = 15
 
-    JOINT_DAMPING = 16
+    JOINT_REST = 16
 
-    CONSTANT = 17
+    JOINT_DAMPING = 17
 
-    COMPILED = 18
+    CONSTANT = 18
+
+    COMPILED = 19
     """the parameters of the compiled terms"""
 
 class ParameterDerivativeKind(enum.Enum):
@@ -253,21 +255,23 @@ class ParameterDerivativeKind(enum.Enum):
 
     ARMATURE = 14
 
-    LENGTH = 15
+    ROTORS = 15
 
-    OFFSET = 16
+    LENGTH = 16
 
-    COEFFICIENT = 17
+    OFFSET = 17
 
-    GAIN_Q = 18
+    COEFFICIENT = 18
 
-    GAIN_Q_DOT = 19
+    GAIN_Q = 19
 
-    TARGET = 20
+    GAIN_Q_DOT = 20
 
-    GEAR = 21
+    TARGET = 21
 
-    TORQUE_LIMIT = 22
+    GEAR = 22
+
+    TORQUE_LIMIT = 23
 
 class Stop:
     """Why and when the loop stopped."""
@@ -442,7 +446,8 @@ class NonDifferentiableEvent:
 def allocate(
     transmission: Annotated[NDArray[numpy.float64], dict(shape=(None, None), writable=False)],
     u: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
-    limit: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    lower: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    upper: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
     weights: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
     preload: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
 ) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]:

@@ -149,7 +149,8 @@ def actuation_table(actuation: Actuation) -> dict[str, Any]:
     return {
         "transmission": np.asfortranarray(actuation.motors.transmission),
         "direct": actuation.is_direct,
-        "limit": actuation.limit,
+        "lower": actuation.limit[0],
+        "upper": actuation.limit[1],
         "weights": actuation.weights,
         "preload": actuation.preload,
     }
@@ -165,14 +166,16 @@ def allocate(transmission: Array, u: Array, limit: Array, weights: Array, preloa
     ----------
     transmission : (d, m) array
     u : (d,) array
-    limit, weights, preload : (m,) arrays
-        The torques minimize ``sum(weights * (tau - preload)**2)`` subject to |tau| <= limit, which may be infinite.
+    limit : (2, m) array
+        Lower and upper limits of the torques, which may be infinite.
+    weights, preload : (m,) arrays
+        The torques minimize ``sum(weights * (tau - preload)**2)`` within the limits.
 
     Returns
     -------
     (m,) array
     """
-    return _core.allocate(np.asfortranarray(transmission, dtype=float), u, limit, weights, preload)
+    return _core.allocate(np.asfortranarray(transmission, dtype=float), u, limit[0], limit[1], weights, preload)
 
 
 def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
@@ -189,7 +192,7 @@ def apply_u(actuation: Actuation, terms: Terms, u: Array) -> Effort:
     if not np.isfinite(u).all():
         raise NumericalError(f"the controller's u is not finite: {u.tolist()}")
     if actuation.is_direct:
-        tau = np.clip(u, -actuation.limit, actuation.limit)
+        tau = np.clip(u, *actuation.limit)
         return Effort(tau, actuation.motors.force(tau), tau)
     transmission = (actuation.motors.transmission @ terms.rho).T  # u = transmission tau
     tau = allocate(transmission, u, actuation.limit, actuation.weights, actuation.preload)
@@ -286,7 +289,8 @@ def law_table(controller: Controller | TorqueController) -> dict[str, Any] | Non
         }
         if controller.gravity:
             balance = actuation_table(controller.balance)
-            servos["gravity"] = {**balance, "limit": np.full(len(balance["limit"]), np.inf)}
+            unlimited = np.full(len(balance["upper"]), np.inf)
+            servos["gravity"] = {**balance, "lower": -unlimited, "upper": unlimited}
         return servos
     desired = _desired(controller.desired) if type(controller) is Tracking else None
     if type(controller) is not Tracking or desired is None:

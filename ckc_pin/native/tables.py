@@ -39,6 +39,7 @@ def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: 
         "closure": closure_table(mechanism.closure, mechanism.n),
         "springs": _springs(mechanism.springs),
         "joints": _joints(mechanism, smoothing),
+        "rotors": mechanism.tree.rotors.ravel() if mechanism.tree.rotors.any() else np.zeros(0),
         "rank": mechanism.rank,
         "q": mechanism.partition.q.tolist(),
         "z": mechanism.partition.z.tolist(),

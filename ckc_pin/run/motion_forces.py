@@ -62,8 +62,8 @@ class MotionForces(HasSummary):
         Configuration, velocity and acceleration by coordinate, in the order of `coordinates`.
     tau : (m, actuators) array
         Motor torques in the order of `actuated`, N m or N; not clipped at the limits.
-    limit : (motors,) array
-        Limits of |tau|; infinite for motors without one.
+    limit : (2, motors) array
+        Lower and upper limits of tau; infinite for motors without one.
     loop_forces : dict of str to (m, rows of the loop) array
         Multipliers of eq. 1 by loop and coupling, N or N m.
     loop_wrenches : dict of str to (m, 6) array
@@ -73,7 +73,8 @@ class MotionForces(HasSummary):
         Wrench that each joint transmits to its child body, at the joint's origin, in world axes: force, N, and moment,
         N m, including those along the joint's axis. Free roots have none.
     exceeded : list of dict
-        Motors whose limit is exceeded: motor, limit, t (the first instant), most (the largest |tau|), t_most.
+        Motors whose limit is exceeded: motor, limit (the size of the one that is exceeded most), t (the first instant),
+        most (the largest |tau| beyond that limit), t_most.
     """
 
     status: Status
@@ -97,9 +98,11 @@ class MotionForces(HasSummary):
         exceeded = {entry["motor"]: entry for entry in self.exceeded}
         for k, (motor, unit) in enumerate(zip(self.actuated, motor_units(self.mechanism), strict=True)):
             items = [self._format_largest(np.abs(self.tau[:, k]), unit)]
-            if np.isfinite(self.limit[k]):
+            lower, upper = self.limit[:, k]
+            if np.isfinite(lower) or np.isfinite(upper):
                 onset = f", exceeded from t = {exceeded[motor]['t']:.4g} s on" if motor in exceeded else ""
-                items.append(f"limit {self.limit[k]:.4g} {unit}{onset}")
+                limits = f"limit {upper:.4g}" if lower == -upper else f"limits {lower:.4g} to {upper:.4g}"
+                items.append(f"{limits} {unit}{onset}")
             rows.append((f"motor {motor}", items))
         for loop, multipliers in self.loop_forces.items():
             if loop not in self.loop_wrenches:
@@ -298,12 +301,13 @@ def collect_forces(
 def _find_exceeded_limits(t: Array, tau: Array, limit: Array, motors: Sequence[str]) -> list[dict[str, Any]]:
     exceeded: list[dict[str, Any]] = []
     for k, motor in enumerate(motors):
-        size, maximum = np.abs(tau[:, k]), float(limit[k])
-        beyond = np.flatnonzero(size > maximum * (1 + LIMIT_TOLERANCE))
+        lower, upper = limit[:, k] * (1 + LIMIT_TOLERANCE)
+        beyond = np.flatnonzero((tau[:, k] < lower) | (tau[:, k] > upper))
         if len(beyond):
-            peak = int(np.argmax(size))
-            exceeded.append({"motor": motor, "limit": maximum, "t": float(t[beyond[0]]), "most": float(size[peak]),
-                             "t_most": float(t[peak])})  # fmt: skip
+            peak = int(np.argmax(np.maximum(lower - tau[:, k], tau[:, k] - upper)))
+            maximum = abs(float(limit[int(tau[peak, k] > upper), k]))
+            exceeded.append({"motor": motor, "limit": maximum, "t": float(t[beyond[0]]),
+                             "most": abs(float(tau[peak, k])), "t_most": float(t[peak])})  # fmt: skip
     return exceeded
 
 

@@ -9,7 +9,6 @@ from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
-import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.library import Library
@@ -241,7 +240,7 @@ def prepare(
         other = mechanism.kinematics(tree.integrate(start.at.q_tree, step))
         later = MEMORY_CHECK_TIME * scene.spec.t_end
         require_no_memory(law, Terms(mechanism, start.at, v_tree), Terms(mechanism, other, v_tree, later))
-    D_tree = mechanism.tree.evaluate(pin.crba, start.at.q_tree)
+    D_tree = mechanism.tree.mass_matrix(start.at.q_tree)
     formulation = _formulation_table(mechanism, scene.spec, np.diagonal(D_tree))
     switches: list[float] = []
     later_motions: list[Desired] = []

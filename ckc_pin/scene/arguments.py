@@ -60,10 +60,17 @@ def name_arrays(data: dict[str, Any], load: Callable[[], Mechanism], source: str
             table = table.get(name) if isinstance(table, Mapping) else None
         if not isinstance(table, dict) or not isinstance(table.get(key), list):
             continue
+        if key == "torque_limit" and _is_pair_of_limits(table[key]):
+            continue
         mechanism = mechanism or load()
         names = mechanism.actuated if path in BY_MOTOR else mechanism.independent
         choices = [names, mechanism.coordinates] if path == ("initial", "q") else [names]
         table[key] = mechanism.name_values(table[key], f"{source}: {'.'.join(path)}", *choices)
+
+
+def _is_pair_of_limits(limits: list[Any]) -> bool:
+    """Whether a list is a lower and an upper limit, of which one is not positive, not the limits of two motors."""
+    return len(limits) == 2 and all(map(is_number, limits)) and min(limits) <= 0
 
 
 def embed_files(controller: dict[str, Any], texts: dict[str, str], *, reads_paths: bool) -> None:

@@ -131,24 +131,26 @@ def _entries(slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
         yield ParameterDerivative("coefficient", int(row), np.array([k, coefficients[row, k]], dtype=float))
     for k in np.flatnonzero(slopes.get("armature", ())):
         yield ParameterDerivative("armature", int(k), slopes["armature"][k : k + 1])
+    rotors = slopes.get("rotors", np.zeros((0, 0)))
+    rotors = rotors + np.triu(rotors, 1).T
+    yield from (ParameterDerivative("rotors", int(k), rotors[k]) for k in np.flatnonzero(rotors.any(axis=1)))
 
 
 def _motors(mechanism: Mechanism, actuation: Actuation, slopes: Mapping[str, Array]) -> Iterator[ParameterDerivative]:
     """A gear acts where a motor's torque is what is given, a limit while it is reached."""
     for number in {int(k) for k in np.argwhere(slopes.get("transmission", np.zeros((0, 0))))[:, 0]}:
         yield ParameterDerivative("gear", number, slopes["transmission"][number])
-    for k in np.flatnonzero(slopes.get("torque_limit", ())):
-        if mechanism.spec.motor[k].torque_limit == actuation.limit[k]:
-            yield ParameterDerivative("torque_limit", int(k), mechanism.motors.transmission[k])
+    limits = np.where(actuation.limit == mechanism.motors.torque_limit, slopes.get("torque_limit", 0.0), 0.0)
+    for k in np.flatnonzero(limits.any(axis=0)):
+        yield ParameterDerivative("torque_limit", int(k), limits[:, k])
 
 
 def _require_motor_derivative(mechanism: Mechanism, actuation: Actuation, name: str) -> None:
     _, motor, key = split_name(name)
     number = mechanism.motors.names.index(motor)
-    if key == "rotor_inertia" and np.count_nonzero(mechanism.motors.transmission[number]) > 1:
-        raise InputError(f"sensitivities: {name}: a motor on several joints has no rotor inertia")
-    limit = mechanism.spec.motor[number].torque_limit
-    if key == "torque_limit" and limit == actuation.limit[number] == actuation.scene_limit[number]:
+    limits = zip(mechanism.motors.torque_limit[:, number], actuation.scene_limit[:, number], strict=True)
+    sides = {"torque_limit.lower": [0], "torque_limit.upper": [1], "torque_limit": [0, 1]}.get(key, [])
+    if any(of_motor == of_scene for side, (of_motor, of_scene) in enumerate(limits) if side in sides):
         raise InputError(
             f"sensitivities: {name}: the controller's torque_limit has the same value, so the derivative exists on "
             "one side only; give only one of the two limits"

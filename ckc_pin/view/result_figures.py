@@ -74,11 +74,10 @@ def _draw_efforts(axes: list[Any], forces: MotionForces, motors_by_unit: dict[st
             motor = forces.actuated[k]
             ax.plot(forces.t, forces.tau[:, k], color=colours.get(motor, style.REST_COLOUR))
             if motor in exceeded:  # Limits that are not exceeded would flatten the curves.
-                for sign in (-1, 1):
-                    limit = exceeded[motor]["limit"]
-                    if np.any(sign * forces.tau[:, k] > limit):
+                for sign, limit in zip((-1, 1), forces.limit[:, k], strict=True):
+                    if np.any(sign * forces.tau[:, k] > sign * limit):
                         colour = colours.get(motor, style.GREY)
-                        ax.axhline(sign * limit, color=colour, linestyle="--", linewidth=0.9)
+                        ax.axhline(limit, color=colour, linestyle="--", linewidth=0.9)
         ax.set_ylabel(axis_label(r"$\tau$", unit))
     if exceeded:
         is_short = len(exceeded) <= MAX_NOTE_MOTORS

@@ -267,6 +267,20 @@ def test_block_with_rotor_damper_friction_and_spring(tmp_path: Path) -> None:
     assert entry["most"] == pytest.approx(abs(tau[peak]), rel=1e-12)
 
 
+def test_limit_with_two_sides_is_exceeded_on_one(tmp_path: Path) -> None:
+    scene = lift(tmp_path)
+    free = inverse_dynamics(scene, {"gravity.z": 0.0, "controller.torque_limit": 1e3}).tau[:, 0]
+    assert free.min() < -1.0
+    motion = inverse_dynamics(scene, {"gravity.z": 0.0, "controller.torque_limit": [2 * free.min(), 0.8 * free.max()]})
+    (entry,) = motion.exceeded
+    assert (entry["limit"], entry["most"]) == (pytest.approx(0.8 * free.max()), free.max())
+    motion = inverse_dynamics(scene, {"gravity.z": 0.0, "controller.torque_limit": [free.min() / 2, 2 * free.max()]})
+    (entry,) = motion.exceeded
+    assert (entry["limit"], entry["most"]) == (pytest.approx(-free.min() / 2), -free.min())
+    assert entry["t"] == motion.t[np.argmax(free < free.min() / 2)]
+    assert "limits" in str(motion)
+
+
 def test_recorded_motion_with_friction(tmp_path: Path) -> None:
     """The block slides and sticks; the rail force does not depend on friction."""
     overrides = {"controller.K_D": 10.0, "t_end": 3.0, "controller.torque_limit": 60.0}

@@ -234,7 +234,7 @@ def test_a_sampled_servo_is_the_controller_evaluated_once_a_sample(formulation: 
     mechanism = load("five_bar")
     servo = JointServo(mechanism, SERVOS, sample_time=0.01)
     limit = np.array(list(LIMIT.values()))
-    servo.limit_torques(limit)
+    servo.limit_torques(np.array([-limit, limit]))
     simulator, x = Simulator("five_bar/swing", {**overrides, "controller": None}), servo.initial_state
     for k in range(50):
         terms = simulator.state.terms

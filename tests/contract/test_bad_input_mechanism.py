@@ -231,10 +231,22 @@ COORDINATE_CHOICES = [
     ),
     _motor("endless ratio", 'joint = "theta_1"\nratio = inf', f"motor[0].ratio = inf: {FINITE}"),
     _motor(
-        "rotor on two joints",
-        'name = "belt"\njoints = {theta_1 = 1.0, theta_3 = 1.0}\nrotor_inertia = 1e-3',
-        "motor 'belt': rotor_inertia goes with a motor on one joint",
+        "rotor on two joints beyond numbers",
+        'name = "belt"\njoints = {theta_1 = 1.0, theta_3 = 1e200}\nrotor_inertia = 1e-3',
+        "motor 'belt': ratio = 1 with rotor_inertia = 0.001 is too large",
     ),
+    *(
+        _motor(
+            f"limits {limits}",
+            f'joint = "theta_1"\ntorque_limit = {limits}',
+            "motor 'theta_1': torque_limit: expected",
+            "a lower limit of at most 0 and an upper one of at least 0",
+        )
+        for limits in ("[0.5, 3.0]", "[1.0, -1.0]", "[0.0, 0.0]")
+    ),
+    _motor("limits of three", 'joint = "theta_1"\ntorque_limit = [1, 2, 3]', "motor[0].torque_limit"),
+    _motor("limits of words", 'joint = "theta_1"\ntorque_limit = "no"', "torque_limit = 'no': expected"),
+    _motor("limits without end", 'joint = "theta_1"\ntorque_limit = [-inf, 1]', FINITE),
     _motor(
         "gear beyond numbers",
         'joint = "theta_1"\nratio = 1e200\nrotor_inertia = 1e-3',

@@ -182,6 +182,15 @@ def test_points_are_sites_and_joints_have_motors(spatial: Mechanism) -> None:
     assert_same(mujoco_model.model.opt.gravity, [1.0, 2.0, -9.0])
 
 
+def test_torque_limits_are_exported() -> None:
+    wheel = LINK.format("x", 1) + MOVES.format("a", "continuous", "base", "x", "0 0 0", "0 0 0", "0 1 0")
+    motor = {"joint": "a", "ratio": -2.0, "torque_limit": [-0.5, 3.0]}
+    mechanism = Mechanism.from_urdf(f'<robot name="r"><link name="base"/>{wheel}</robot>', motors=[motor])
+    model: Any = mujoco.MjModel.from_xml_string(export(mechanism, "mjcf").text)
+    assert model.actuator("a").forcerange.tolist() == [-0.5, 3.0]
+    assert model.actuator("a").forcelimited[0]
+
+
 def test_armature_friction_and_stops_are_exported(spatial: Mechanism) -> None:
     """A range without stops is exported as inactive."""
     model = MujocoModel(spatial).model

@@ -86,7 +86,7 @@ def test_limited_torques_agree_with_the_reference(unlimited: Run, limit: float) 
         T = transmission(run.mechanism, q_tree)
         assert_close(T @ run.tau[k], run.u[k], 1e-9)
         if limit == 21.0:
-            tau = allocate(T, unlimited.u[k], np.full(12, limit), np.ones(12), preload)
+            tau = allocate(T, unlimited.u[k], np.outer([-limit, limit], np.ones(12)), np.ones(12), preload)
             assert_close(run.tau[k], tau, 1e-7)
     off = np.abs(run.q_tree - unlimited.q_tree).max()
     assert off < 1e-9 if limit == 21.0 else off > 1e-5
@@ -105,7 +105,9 @@ def test_unreachable_u_has_minimum_error() -> None:
     missed = 0.5 * np.sum((rows * (T @ run.tau[0] - free.u[0])) ** 2)
     assert result.cost <= missed < result.cost * (1 + 1e-4)
     assert np.all(np.abs(run.tau) <= limit)
-    assert_close(run.tau[0], allocate(T, free.u[0], np.full(12, limit), np.ones(12), np.zeros(12)), 1e-7)
+    assert_close(
+        run.tau[0], allocate(T, free.u[0], np.outer([-limit, limit], np.ones(12)), np.ones(12), np.zeros(12)), 1e-7
+    )
 
 
 def test_motor_table_limits_apply(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def test_right_hand_sides_off_the_manifold_equal_numpy(scene, coordinates, conve
     )
 
 
-@pytest.mark.parametrize("limit", [0.3, {"theta_1": 1.0}])
+@pytest.mark.parametrize("limit", [0.3, {"theta_1": 1.0}, [-0.2, 0.6], {"theta_3": [0.0, 0.4]}])
 def test_right_hand_sides_at_torque_limits_equal_numpy(limit):
     _assert_same_rhs("five_bar/tracking", {"controller.torque_limit": limit}, tolerance=1e-9)
 

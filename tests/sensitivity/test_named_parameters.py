@@ -127,7 +127,7 @@ TORQUES = '[controller]\ntype = "torques"\nfile = "tau.csv"\ninterpolation = "li
 def write_driven_four_bar(
     folder: Path,
     controller: str,
-    limit: float,
+    limit: float | str,
     formulation: str = "dae",
     torques: str = "t,a\n0,0.4\n0.5,0.1\n2,-0.3\n",
 ) -> str:
@@ -158,6 +158,30 @@ def test_a_torque_limit_that_is_reached(tmp_path: Path) -> None:
     result = sensitivities(scene, ["motor.a.torque_limit", "motor.a.ratio"], TIGHT)
     assert np.abs(result.run.tau).max() == 0.25
     agree(result, scene, TIGHT, parts=("q_tree", "v_tree", "u", "tau"))
+
+
+@pytest.mark.parametrize("torques", ["t,a\n0,0.4\n2,0.3\n", "t,a\n0,-0.4\n2,-0.3\n"], ids=["upper", "lower"])
+def test_a_torque_limit_with_two_sides(torques: str, tmp_path: Path) -> None:
+    """The motion depends on the limit that is reached."""
+    scene = write_driven_four_bar(tmp_path, TORQUES, "[-0.1, 0.25]", torques=torques)
+    names = ["motor.a.torque_limit.lower", "motor.a.torque_limit.upper"]
+    result = sensitivities(scene, names, TIGHT)
+    is_upper = "-" not in torques
+    assert set(result.run.tau[:, 0]) == {0.25 if is_upper else -0.1}
+    idle = names[0] if is_upper else names[1]
+    agree(result, scene, TIGHT, parts=("q_tree", "v_tree", "u", "tau"), zero=(idle,))
+    assert not result.q_tree[:, :, names.index(idle)].any()
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "dae"])
+def test_parameters_of_a_motor_on_several_joints(formulation: str, tmp_path: Path) -> None:
+    """Its rotor couples the inertias of the joints. The gear ratio scales the torque, too."""
+    motor = '[[motor]]\nname = "m"\njoints = { ra = 1.0, lb = -0.5, w = 2.0 }\nratio = 3.0\nrotor_inertia = 0.01\n'
+    scene = write_arms(tmp_path, "hinge", formulation, motor)
+    names = ["motor.m.rotor_inertia", "motor.m.ratio", "link.lhand.mass"]
+    agree(sensitivities(scene, names, TIGHT), scene, TIGHT, h=2e-3, tolerance=2e-8)
+    compiled = {**TIGHT, "solver.terms": "generated"}
+    agree(sensitivities(scene, names, compiled), scene, compiled, h=2e-3, tolerance=2e-8)
 
 
 def test_equal_torque_limits_of_motor_and_controller_are_rejected(tmp_path: Path) -> None:

@@ -228,7 +228,7 @@ def _add_actuators(mechanism: Mechanism, root: Element) -> None:
         return
     actuators = SubElement(root, "actuator")
     motors = mechanism.motors
-    for name, turns, limit in zip(motors.names, motors.transmission, motors.torque_limit, strict=True):
+    for name, turns, limits in zip(motors.names, motors.transmission, motors.torque_limit.T, strict=True):
         joints = np.flatnonzero(turns)
         motor = SubElement(actuators, "motor", name=name)
         if len(joints) == 1:
@@ -240,9 +240,9 @@ def _add_actuators(mechanism: Mechanism, root: Element) -> None:
             tendon = SubElement(_tendon_section(root), "fixed", name=name)
             for k in joints:
                 SubElement(tendon, "joint", joint=mechanism.coordinates[k], coef=_format(turns[k]))
-        if np.isfinite(limit):
+        if np.isfinite(limits).all():
             motor.set("forcelimited", "true")
-            motor.set("forcerange", _format(np.array([-limit, limit])))
+            motor.set("forcerange", _format(limits))
     for k in np.flatnonzero(constant):
         name = mechanism.coordinates[k]
         bias = f"{_format(constant[k])} 0 0"

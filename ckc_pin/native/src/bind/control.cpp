@@ -149,14 +149,19 @@ class CallbackController : public Controller {
   Vector v_;
 };
 
+void require_limits(const Vector& lower, const Vector& upper, Eigen::Index motors) {
+  require(lower.size() == motors && upper.size() == motors && (lower.array() <= upper.array()).all(),
+          "lower, upper: for each motor, a lower limit and one that is not smaller are needed");
+}
+
 Actuation actuation_from_table(const nb::dict& table, const Core& core) {
   const auto transmission = get<Matrix>(table, "transmission");
-  const auto limit = get<Vector>(table, "limit"), weights = get<Vector>(table, "weights"),
+  const auto lower = get<Vector>(table, "lower"), upper = get<Vector>(table, "upper"), weights = get<Vector>(table, "weights"),
              preload = get<Vector>(table, "preload");
   const auto m = transmission.rows();
   require(transmission.cols() == core.n && transmission.allFinite(),
           "transmission: a finite column per coordinate is needed");
-  require(limit.size() == m && (limit.array() >= 0).all(), "limit: positive numbers are needed");
+  require_limits(lower, upper, m);
   require(weights, m, "weights"), require(preload, m, "preload");
   require((weights.array() > 0).all(), "weights: positive numbers are needed");
   std::vector<std::vector<Actuation::Gear>> gears(m);
@@ -164,7 +169,7 @@ Actuation actuation_from_table(const nb::dict& table, const Core& core) {
     for (int j = 0; j < core.n; ++j)
       if (transmission(k, j) != 0.0) gears[k].push_back({j, transmission(k, j)});
   return {core, std::move(gears), get<bool>(table, "direct"),
-          Allocation(static_cast<int>(m), core.d, limit, weights, preload)};
+          Allocation(static_cast<int>(m), core.d, lower, upper, weights, preload)};
 }
 
 std::unique_ptr<Controller> joint_servo_from_table(const nb::dict& table, const Core& core, Eigen::Index motors) {
@@ -172,7 +177,8 @@ std::unique_ptr<Controller> joint_servo_from_table(const nb::dict& table, const 
   for (const auto& servo : get<std::vector<nb::dict>>(table, "servos")) {
     servos.push_back({get<int>(servo, "motor"), get<int>(servo, "joint"), get<double>(servo, "gear"),
                       get<bool>(servo, "of_rate"), get<double>(servo, "K_P"), get<double>(servo, "K_I"),
-                      get<double>(servo, "K_D"), get<double>(servo, "limit"), get<double>(servo, "unwinding")});
+                      get<double>(servo, "K_D"), get<double>(servo, "lower"), get<double>(servo, "upper"),
+                      get<double>(servo, "unwinding")});
     require_indices({servos.back().motor}, static_cast<int>(motors), "motor of a servo");
     require_indices({servos.back().joint}, core.n, "joint of a servo");
     require(servos.back().gear != 0.0, "gear of a servo: a number other than zero is needed");
@@ -275,14 +281,15 @@ std::unique_ptr<BodyForces> forces_from_tables(const std::vector<nb::dict>& tabl
 namespace {
 
 // `transmission` (d, motors): u = transmission tau.
-Vector allocate(MatrixArg transmission, VectorArg u, VectorArg limit, VectorArg weights, VectorArg preload) {
+Vector allocate(MatrixArg transmission, VectorArg u, VectorArg lower, VectorArg upper, VectorArg weights,
+                VectorArg preload) {
   const Eigen::Index d = transmission.rows(), m = transmission.cols();
   require(transmission.allFinite(), "transmission: finite numbers are needed");
   require(u, d, "u"), require(weights, m, "weights"), require(preload, m, "preload");
-  require(limit.size() == m && (limit.array() >= 0).all(), "limit: a positive number for each motor is needed");
+  require_limits(lower, upper, m);
   require((weights.array() > 0).all(), "weights: positive numbers are needed");
   Vector tau(m);
-  Allocation(static_cast<int>(m), static_cast<int>(d), limit, weights, preload)
+  Allocation(static_cast<int>(m), static_cast<int>(d), lower, upper, weights, preload)
       .allocate(transmission.transpose(), u, tau);
   return tau;
 }
@@ -325,7 +332,7 @@ std::unique_ptr<Control> control_from_table(const nb::dict& table, const Core& c
 
 void bind_allocation(nb::module_& m) {
   using namespace nb::literals;
-  m.def("allocate", &allocate, "transmission"_a, "u"_a, "limit"_a, "weights"_a, "preload"_a,
+  m.def("allocate", &allocate, "transmission"_a, "u"_a, "lower"_a, "upper"_a, "weights"_a, "preload"_a,
         "Return the motor torques with u = transmission tau that are nearest to a preload, within limits.");
 }
 

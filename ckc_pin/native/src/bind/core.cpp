@@ -111,6 +111,7 @@ std::unique_ptr<Core> core_from_table(const nb::dict& table) {
       closure_from_table(get<nb::dict>(table, "closure")),
       springs_from_table(get<nb::dict>(table, "springs")),
       joints_from_table(get<nb::dict>(table, "joints")),
+      get<Vector>(table, "rotors"),
       get<int>(table, "rank"),
       {get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")},
       table.contains("compiled") ? compiled_terms_from(get<nb::tuple>(table, "compiled")) : nullptr,

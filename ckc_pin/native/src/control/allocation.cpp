@@ -12,8 +12,9 @@ constexpr double penalty = 1e-7;               // weight of a deviation from u, 
 constexpr double full_step_tolerance = 1e-6;   // a Newton step whose length differs from 1 by less is a full step
 constexpr int max_newton_steps = 50;           // random problems need at most 10
 
-Allocation::Allocation(int motors, int d, Vector limit_, Vector weights, Vector preload)
-    : limit(std::move(limit_)),
+Allocation::Allocation(int motors, int d, Vector lower_, Vector upper_, Vector weights, Vector preload)
+    : lower(std::move(lower_)),
+      upper(std::move(upper_)),
       weights_(std::move(weights)),
       preload_(std::move(preload)),
       scale_(weights_.cwiseSqrt().cwiseInverse()),
@@ -41,7 +42,7 @@ void Allocation::allocate(const Matrix& transmission, In u, Out tau) {
     scaled_ = transmission.transpose();
     factor_.compute(scaled_), factor_.solve(u, tau);
   }
-  if (!(tau.array().abs() > limit.array()).any()) return;
+  if (!(tau.array() > upper.array() || tau.array() < lower.array()).any()) return;
   unlimited_ = tau;
   if (redundant_ && (solve_with_limits(transmission, u, tau, 0.0) || solve_with_limits(transmission, u, tau, penalty)))
     return;
@@ -58,7 +59,10 @@ bool Allocation::solve_with_limits(const Matrix& transmission, In u, Out tau, do
   coefficients_ = u.cwiseProduct(row_scale_);
   double size = coefficients_.norm(), steepest = 0.0;
   for (Eigen::Index k = 0; k < m; ++k) {
-    if (std::isfinite(limit(k))) size += limit(k) * scaled_.row(k).norm();
+    double largest = 0.0;
+    for (const double limit : {lower(k), upper(k)})
+      if (std::isfinite(limit)) largest = std::max(largest, std::abs(limit));
+    size += largest * scaled_.row(k).norm();
     steepest += scaled_.row(k).squaredNorm() / weights_(k);
   }
   multiplier_.setZero(), free_.assign(m, 0), penalty_weight *= steepest;
@@ -74,7 +78,7 @@ bool Allocation::solve_with_limits(const Matrix& transmission, In u, Out tau, do
     bool active_set_unchanged = took_full_step;
     curvature_.setZero();
     for (Eigen::Index k = 0; k < m; ++k) {
-      const int is_free = std::abs(unclamped_(k)) < limit(k);
+      const int is_free = lower(k) < unclamped_(k) && unclamped_(k) < upper(k);
       active_set_unchanged &= free_[k] == is_free, free_[k] = is_free;
       if (is_free) curvature_.noalias() += (1.0 / weights_(k)) * scaled_.row(k).transpose() * scaled_.row(k);
     }
@@ -112,10 +116,10 @@ bool Allocation::is_out_of_reach(In u, double tolerance) const {
   const double length = multiplier_.norm();
   double bound = tolerance * length;
   for (Eigen::Index k = 0; k < unclamped_.size(); ++k) {
-    const double pull = std::abs(unclamped_(k));
-    if (std::isfinite(limit(k)))
-      bound += limit(k) * pull;
-    else if (pull > u_rounding * length * scaled_.row(k).norm())
+    const double pull = unclamped_(k), limit = pull > 0.0 ? upper(k) : lower(k);
+    if (std::isfinite(limit))
+      bound += limit * pull;
+    else if (std::abs(pull) > u_rounding * length * scaled_.row(k).norm())
       return false;
   }
   return multiplier_.dot(u.cwiseProduct(row_scale_)) > bound;
@@ -128,9 +132,9 @@ double Allocation::line_search(double penalty_curvature) {
   Eigen::Index count = 0;
   for (Eigen::Index k = 0; k < m; ++k) {
     becomes_free_(k) = 0.0, becomes_limited_(k) = tau_direction_(k) == 0.0 ? 0.0 : infinity;
-    if (tau_direction_(k) == 0.0 || !std::isfinite(limit(k))) continue;
-    const double low = (-limit(k) - unclamped_(k)) / tau_direction_(k),
-                 high = (limit(k) - unclamped_(k)) / tau_direction_(k);
+    if (tau_direction_(k) == 0.0 || !is_limited(k)) continue;
+    const double low = (lower(k) - unclamped_(k)) / tau_direction_(k),
+                 high = (upper(k) - unclamped_(k)) / tau_direction_(k);
     becomes_free_(k) = std::max(0.0, std::min(low, high)), becomes_limited_(k) = std::max(0.0, std::max(low, high));
     breakpoints_(count++) = becomes_free_(k), breakpoints_(count++) = becomes_limited_(k);
   }

@@ -15,16 +15,17 @@ namespace ckc {
 // continuous. Rows of u are scaled by the norms of their rows of transmission^T.
 class Allocation {
  public:
-  Allocation(int motors, int d, Vector limit, Vector weights, Vector preload);
+  Allocation(int motors, int d, Vector lower, Vector upper, Vector weights, Vector preload);
   void allocate(const Matrix& transmission, In u, Out tau);  // transmission: (motors, d)
-  void clamp(Out tau) const { tau = tau.cwiseMin(limit).cwiseMax(-limit); }
+  void clamp(Out tau) const { tau = tau.cwiseMin(upper).cwiseMax(lower); }
 
   bool is_redundant() const { return redundant_; }
 
-  const Vector limit;  // infinite where there is none
+  const Vector lower, upper;  // torque limits; infinite where there is none
 
  private:
   bool solve_with_limits(const Matrix& transmission, In u, Out tau, double penalty_weight);
+  bool is_limited(Eigen::Index k) const { return std::isfinite(lower(k)) || std::isfinite(upper(k)); }
   bool is_out_of_reach(In u, double tolerance) const;
   double line_search(double penalty_curvature);  // step length that maximizes the dual; infinite if unbounded
 

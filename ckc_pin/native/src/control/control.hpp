@@ -116,7 +116,10 @@ class Actuation {
   const std::vector<std::vector<Gear>> gears;
   const bool is_direct;  // one motor on each coordinate of q, so that tau = u
   bool is_redundant() const { return allocation_.is_redundant(); }
-  bool is_at_limit(const Vector& tau, Eigen::Index k) const { return std::abs(tau(k)) >= allocation_.limit(k); }
+  // -1 if a motor is at its lower limit, 1 at its upper limit, else 0.
+  int limit_side(const Vector& tau, Eigen::Index k) const {
+    return tau(k) >= allocation_.upper(k) ? 1 : tau(k) <= allocation_.lower(k) ? -1 : 0;
+  }
 
  private:
   void motor_forces(In tau, Out u_tree) const;
@@ -179,7 +182,8 @@ class Control {
   bool derivatives(Core& core, Matrix& by_q, Matrix& by_v, Vector& force);
   // Whether component k of u responds to the state, i.e. its motor is not at its limit.
   bool responds(Eigen::Index k) const { return !(is_direct() && is_at_limit(k)); }
-  bool is_at_limit(Eigen::Index k) const { return actuation_.is_at_limit(tau, k); }  // of a motor
+  int limit_side(Eigen::Index k) const { return actuation_.limit_side(tau, k); }  // of a motor
+  bool is_at_limit(Eigen::Index k) const { return limit_side(k) != 0; }
   bool is_direct() const { return actuation_.is_direct; }
   bool is_redundant() const { return actuation_.is_redundant(); }
   // whether motor torques are prescribed

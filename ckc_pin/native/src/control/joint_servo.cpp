@@ -48,7 +48,7 @@ bool JointServo::state_rate(const MeasuredState&, Out rate, ControlFailure&) {
     if (integral_[i] < 0) continue;
     const Servo& servo = servos_[i];
     const auto k = static_cast<Eigen::Index>(i);
-    const double excess = requested_(k) - std::clamp(requested_(k), -servo.limit, servo.limit);
+    const double excess = requested_(k) - std::clamp(requested_(k), servo.lower, servo.upper);
     rate(integral_[i]) = -servo.K_I * error_(k) - servo.unwinding * servo.gear * excess;
   }
   return true;

@@ -10,7 +10,7 @@ struct Servo {
   double gear;           // shaft rate by joint rate
   bool of_rate;          // velocity mode: the error is that of the rate, and K_D does not act
   double K_P, K_I, K_D;  // at the joint
-  double limit;          // of the motor's torque
+  double lower, upper;   // limits of the motor's torque
   double unwinding;      // 1/s: rate at which the integral follows a torque at its limit
 };
 

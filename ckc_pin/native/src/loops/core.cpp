@@ -34,8 +34,9 @@ Core::Core(CoreTable table)
   tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
   tangent_matrix_.setZero(n - rank, n - rank), tangent_factor_.resize(n - rank);
   rho_times_x_.setZero(n), tangent_solution_.setZero(n - rank), tangent_rhs_.setZero(n - rank);
+  if (table.rotors.size()) tree.set_parameters(Tree::Parameter::rotors, table.rotors);
   size_t entries = 0;
-  for (const Indices& above : tree.ancestors) entries += 2 * above.size();
+  for (const Indices& rows : tree.inertia_pattern) entries += 2 * rows.size();
   D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
 }
 
@@ -64,6 +65,7 @@ Eigen::Index Core::parameter_size(Parameter parameter) const {
     case Parameter::length:
     case Parameter::affine_offset: return m;
     case Parameter::affine: return m * n;
+    case Parameter::rotors: return n * n;
     case Parameter::end: return 6 * springs.count();
     case Parameter::stiffness:
     case Parameter::rest_length:
@@ -189,7 +191,7 @@ void Core::multiply_D_tree(In x, Out product) const {
   product.setZero();
   for (int j = 0; j < n; ++j) {
     double sum = 0.0;
-    for (int i : tree.ancestors[j]) {
+    for (int i : tree.inertia_pattern[j]) {
       if (i == j) continue;
       product(i) += D(i, j) * x(j);
       sum += D(i, j) * x(i);

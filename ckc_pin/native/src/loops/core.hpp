@@ -39,6 +39,7 @@ struct CoreTable {
   Closure closure;
   SpringTable springs;
   JointTable joints;
+  Vector rotors;  // (n * n), as Tree::Parameter::rotors; empty without motors on several joints that have a rotor
   int rank;  // of J at a regular configuration
   Scales scales;
   std::unique_ptr<CompiledTerms> compiled;  // null: Pinocchio's terms
@@ -73,6 +74,7 @@ class Core {
     centre,
     inertia,
     armature,
+    rotors,
     point,
     length,
     affine,

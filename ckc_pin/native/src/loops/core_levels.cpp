@@ -113,9 +113,10 @@ bool Core::project_by_mass_levels(In u_tree, Out a) {
     compute_spring_forces();
   else
     elastic_.setZero();
-  y_ = u_tree + elastic_ + damping_tree - tree.armature().cwiseProduct(x_);
+  const Matrix rotors = tree.rotor_inertia();
+  y_ = u_tree + elastic_ + damping_tree - rotors * x_;
   Vector force = directions.transpose() * y_;
-  D_levels.noalias() = directions.transpose() * tree.armature().asDiagonal() * directions;
+  D_levels.noalias() = directions.transpose() * rotors * directions;
   for (int i = 0; i < freedoms; ++i)
     for (int r = 0; r < count; ++r) {
       if (level[r] < level_of[i]) continue;

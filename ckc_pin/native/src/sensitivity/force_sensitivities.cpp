@@ -19,7 +19,7 @@ void Sensitivities::force_sensitivities(In v, const Matrix& s, Matrix& u, Matrix
   for (int p = 0; p < count; ++p)
     for (const ParameterDerivative& of : table_.parameters[p].derivatives) {
       if (of.kind == ParameterDerivative::gear) gear_force_.col(p) += control.tau(of.index) * of.numbers;
-      if (of.kind == ParameterDerivative::torque_limit) tau(of.index, p) += torque_limit_side(of.index);
+      if (of.kind == ParameterDerivative::torque_limit) tau(of.index, p) += limited_torque_derivative(of);
     }
   if (!outputs_torques) {
     if (!system_.control.derivatives(core_, u_by_q_, u_by_v_, applied_force_)) {

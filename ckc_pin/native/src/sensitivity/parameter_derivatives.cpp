@@ -83,6 +83,7 @@ void Sensitivities::add_term_derivative(const ParameterDerivative& of, In a, In 
       break;
     case ParameterDerivative::inertia: add_inertia(of, impulsive, force); break;
     case ParameterDerivative::armature: force(k) += of.numbers(0) * a(k); break;
+    case ParameterDerivative::rotors: force(k) += of.numbers.dot(a); break;
     case ParameterDerivative::coefficient: {
       const int coordinate = static_cast<int>(of.numbers(0));
       force(coordinate) -= of.numbers(1) * lambda(k), row(k) += of.numbers(1) * a(coordinate);
@@ -138,7 +139,7 @@ void Sensitivities::add_control_derivatives(In q_tree, In v, Matrix& force) {
       if (of.kind == ParameterDerivative::gear)
         force.col(p) -= control.tau(k) * of.numbers;
       else if (limited)
-        force.col(p) -= torque_limit_side(k) * of.numbers;
+        force.col(p) -= limited_torque_derivative(of) * table_.transmission.row(k).transpose();
     }
   if (motors_are_limited)
     force.noalias() -= table_.transmission.transpose() * limited_tau_;

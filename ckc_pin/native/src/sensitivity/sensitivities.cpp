@@ -154,7 +154,12 @@ bool Sensitivities::compute_applied_force(In v) {
 
 int Sensitivities::torque_limit_side(int motor) const {
   const Control& control = system_.control;
-  return control.is_at_limit(motor) ? (control.tau(motor) > 0.0 ? 1 : -1) : 0;
+  return control.limit_side(motor);
+}
+
+double Sensitivities::limited_torque_derivative(const ParameterDerivative& of) const {
+  const int side = torque_limit_side(of.index);
+  return side ? of.numbers(side > 0 ? 1 : 0) : 0.0;
 }
 
 void Sensitivities::accept() {

@@ -35,6 +35,7 @@ struct ParameterDerivative {
     lower,
     upper,
     armature,  // numbers: armature (1)
+    rotors,    // numbers: row of the matrix that rotors of motors on several joints add to D' (n)
     // index: row of phi
     length,
     offset,
@@ -44,7 +45,7 @@ struct ParameterDerivative {
     gain_q_dot,    // index: unused; numbers: K_V or K_D, by columns
     target,        // index: component of q_d; numbers: column of K_P
     gear,          // index: motor; numbers: its transmission by coordinate (n)
-    torque_limit,  // index: motor; numbers: its transmission by coordinate (n), which is not differentiated
+    torque_limit,  // index: motor; numbers: derivatives of its lower and its upper limit (2)
   };
   Kind kind;
   int index;
@@ -138,6 +139,7 @@ class Sensitivities {
   void configuration_rate_sensitivities(In v, const Eigen::Ref<const Matrix>& s, Eigen::Ref<Matrix> s_dot) const;
   void prepare_compiled();
   int torque_limit_side(int motor) const;  // -1 or 1 if the motor is at a limit, else 0
+  double limited_torque_derivative(const ParameterDerivative& of) const;  // of a torque_limit; 0 within the limits
   void assemble_direction(const Eigen::Ref<const Matrix>& s, int p, bool force_changes, Out direction);
   bool compute_applied_force(In v);                      // sets applied_force_, and its derivatives if has_feedback_
   void add_feedback(const Eigen::Ref<const Matrix>& s);  // to force_

@@ -50,6 +50,7 @@ Tree::Tree(const std::string& serialized, Indices q_index_) : q_index(std::move(
       ancestors[k] = support[joint];
     }
   }
+  inertia_pattern = ancestors;
 }
 
 Tree::~Tree() = default;
@@ -59,6 +60,7 @@ void Tree::set_parameters(Parameter parameter, In values) {
   const auto vector_of = [&](int joint) { return Vector3(values.segment<3>(3 * joint)); };
   if (parameter == Parameter::gravity) model.gravity.linear() = vector_of(0);
   if (parameter == Parameter::armature) model.armature = values;
+  if (parameter == Parameter::rotors) set_rotors(values);
   for (int joint = 0; joint < joints; ++joint) {
     pin::Inertia& body = model.inertias[joint];
     if (parameter == Parameter::offset) model.jointPlacements[joint].translation() = vector_of(joint);
@@ -69,6 +71,19 @@ void Tree::set_parameters(Parameter parameter, In values) {
   }
 }
 
+void Tree::set_rotors(In values) {
+  rotors_.setZero(n, n), shared_rotor_.assign(n, {}), inertia_pattern = ancestors;
+  workspace_->data.M.setZero();  // its entries of earlier rotors between branches
+  for (int j = 0; j < n; ++j)
+    for (int i = 0; i <= j; ++i) {
+      rotors_(i, j) = rotors_(j, i) = values(n * i + j);
+      if (rotors_(i, j) == 0.0) continue;
+      shared_rotor_[j].push_back(i);
+      if (!std::binary_search(ancestors[j].begin(), ancestors[j].end(), i)) inertia_pattern[j].push_back(i);
+    }
+  for (Indices& rows : inertia_pattern) std::sort(rows.begin(), rows.end());
+}
+
 void Tree::set_configuration(In q) { pin::computeJointJacobians(workspace_->model, workspace_->data, q); }
 
 const Matrix6x& Tree::jacobian() const { return workspace_->data.J; }
@@ -77,7 +92,17 @@ Matrix3 Tree::rotation(int joint) const { return workspace_->data.oMi[joint].rot
 
 Vector3 Tree::translation(int joint) const { return workspace_->data.oMi[joint].translation(); }
 
-void Tree::compute_D(In q) { pin::crba(workspace_->model, workspace_->data, q, pin::Convention::WORLD); }
+void Tree::compute_D(In q) {
+  pin::crba(workspace_->model, workspace_->data, q, pin::Convention::WORLD);
+  if (!rotors_.size()) return;
+  Matrix& D = workspace_->data.M;
+  for (int j = 0; j < n; ++j)
+    for (int i : shared_rotor_[j]) {
+      // The algorithm writes the entries of ancestors only.
+      const bool is_written = std::binary_search(ancestors[j].begin(), ancestors[j].end(), i);
+      D(i, j) = (is_written ? D(i, j) : 0.0) + rotors_(i, j);
+    }
+}
 
 const Matrix& Tree::D() const { return workspace_->data.M; }
 
@@ -137,7 +162,11 @@ Tree::Body Tree::body(int joint) const {
   return {body.mass(), body.lever(), body.inertia().matrix()};
 }
 
-const Vector& Tree::armature() const { return workspace_->model.armature; }
+Matrix Tree::rotor_inertia() const {
+  Matrix inertia = rotors_.size() ? rotors_ : Matrix::Zero(n, n);
+  inertia.diagonal() += workspace_->model.armature;
+  return inertia;
+}
 
 Vector6 Tree::spatial_gravity() const { return workspace_->model.gravity.toVector(); }
 

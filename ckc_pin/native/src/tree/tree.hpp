@@ -24,12 +24,16 @@ class Tree {
   std::vector<Root> roots;
   Indices single_dof;              // tangent coordinates of joints with one degree of freedom
   std::vector<Indices> support;    // by joint: the tangent coordinates that move it, ascending
-  std::vector<Indices> ancestors;  // by coordinate: those at or above it on its branch, where D' is not zero
+  std::vector<Indices> ancestors;  // by coordinate: those at or above it on its branch
+  // By coordinate j: the rows i <= j where D' may be different from zero. These are the ancestors, and coordinates that
+  // share a rotor with j.
+  std::vector<Indices> inertia_pattern;
   Indices joint_of;                // by coordinate: its joint
   Indices parent;                  // by joint
 
-  // Replace one kind of parameter for all joints; `values`: concatenated by joint (gravity: three, armature: n).
-  enum class Parameter { gravity, offset, mass, centre, inertia, armature };
+  // Replace one kind of parameter for all joints; `values`: concatenated by joint (gravity: three, armature: n, rotors: the
+  // upper triangle, row by row in (n, n), of the matrix that rotors of motors on several joints add to D').
+  enum class Parameter { gravity, offset, mass, centre, inertia, armature, rotors };
   void set_parameters(Parameter parameter, In values);
 
   // Factor (at least one) by which closure tolerances grow at q: large coordinates carry larger rounding errors.
@@ -68,7 +72,8 @@ class Tree {
     Matrix3 inertia;
   };
   Body body(int joint) const;  // in world axes, the inertia about the centre of mass
-  const Vector& armature() const;
+  // Constant part of D' (n, n): armatures, and rotors of motors on several joints.
+  Matrix rotor_inertia() const;
 
   // Operations on q'. A free root has a position and a unit quaternion, and moves by a twist in its own axes.
   void normalize(Out q) const;
@@ -89,6 +94,10 @@ class Tree {
   Vector6 twist_to(In q, Root root, const Matrix3& orientation, const Vector3& position) const;
 
  private:
+  void set_rotors(In values);
+
+  Matrix rotors_;                      // (n, n); empty without motors on several joints that have a rotor
+  std::vector<Indices> shared_rotor_;  // by coordinate j: the rows i <= j where rotors_ is not zero
   struct Workspace;
   std::unique_ptr<Workspace> workspace_;
 };
