@@ -108,7 +108,7 @@ def require_direction(values: Iterable[float], where: str) -> np.ndarray[tuple[i
 # --- rotations -----------------------------------------------------------------------------------------------------
 
 
-def from_quaternion(quaternion: Sequence[float]) -> Array:
+def from_quaternion(quaternion: Sequence[float] | Array) -> Array:
     """Return the rotation matrix of a quaternion (w, x, y, z), which need not be normalized."""
     return np.array(pin.Quaternion(*map(float, quaternion)).normalized().matrix())
 

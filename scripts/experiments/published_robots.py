@@ -115,7 +115,7 @@ def row(name: str, path: Path) -> str:
     counted = [f"{count} {what}{'s' * (count > 1)}" for what, count in counts.items() if count]
     remarks = counted + _remarks([*draft.guessed, *draft.left_out])
     with tempfile.TemporaryDirectory() as folder:
-        file, _ = write(draft, Path(folder))
+        file, *_ = write(draft, Path(folder))
         try:
             checked = ckc_pin.check(file)
         except ckc_pin.MechanismError as error:

@@ -76,7 +76,7 @@ class Compiled:
             spec = compiled._parse(document)
             spec.assets, missing = compiled._remove_unneeded_meshes(spec, document)
             try:
-                compiled.model = spec.compile()
+                compiled.model = compiled._compile(spec)
             except (ValueError, RuntimeError) as error:
                 raise _explain_error(document, error) from None
         compiled._check_numbers()
@@ -90,6 +90,18 @@ class Compiled:
         """Return the name of a site, tendon, actuator or other object by its number; empty if it has none."""
         name: str = getattr(self.model, kind)(int(number)).name
         return name
+
+    def _compile(self, spec: Any) -> Any:
+        """Compile a model, without its key frames if they do not fit to it."""
+        try:
+            return spec.compile()
+        except (ValueError, RuntimeError) as error:
+            if not spec.keys or "key" not in str(error):
+                raise
+            self.warnings.append(f"key frames are left out: {_join_lines(str(error))}")
+            for key in list(spec.keys):
+                spec.delete(key)
+            return spec.compile()
 
     def _parse(self, document: Document) -> Any:
         """Parse the XML. Attached models are parsed on their own first, so that a message names the right model."""

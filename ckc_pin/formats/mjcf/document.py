@@ -25,13 +25,11 @@ from ckc_pin.formats.repository import repository_of, resolve_links
 
 __all__ = ["MAX_MAGNITUDE", "Document"]
 
-ASSEMBLED_KEY = "assembled"  # name of the key frame that `ckc export` writes
 MAX_MAGNITUDE = 1e100  # of any number in a model; squares of larger numbers overflow
 MAX_BODIES, MAX_ELEMENTS = 1000, 20_000  # after <replicate> and <attach>; MuJoCo needs seconds to compile these
 MAX_MESH_PARAMETER = 1000  # a built-in mesh has as many vertices as its parameters say
 MAX_MESH_BYTES = 64 * 2**20
 
-KEY_FRAME_NOTE = "key frames; one of them may be a better [q_guess]"
 SECTION_NOTES = {  # sections that are removed with a note
     "contact": "contact pairs and exclusions, because contact is not supported",
     "deformable": "deformable bodies",
@@ -214,25 +212,23 @@ class Document:
             element.text = element.tail = None
             _check_numbers(element, source)
         document = cls(source, root, files)
-        document._remove_sections(keep_key=not attached_by)
+        document._remove_sections(keep_keys=not attached_by)
         document._remove_elements()
         document._replace_meshes(path.parent)
         document._read_attached_models(path.parent, (*attached_by, path.resolve()))
         indent(root)
         return document
 
-    def _remove_sections(self, keep_key: bool) -> None:
+    def _remove_sections(self, keep_keys: bool) -> None:
         """Remove sections without influence on a mechanism, and note those with influence on MuJoCo's motion."""
         for section in list(self.root):
             if section.tag in SECTION_NOTES and len(section):
                 self._add_note(SECTION_NOTES[section.tag])
             if section.tag in SECTION_NOTES or section.tag in IRRELEVANT_SECTIONS:
                 self.root.remove(section)
-        for keyframe in self.root.findall("keyframe"):
-            for key in keyframe.findall("key"):
-                if not keep_key or key.get("name") != ASSEMBLED_KEY:
-                    self._add_note(KEY_FRAME_NOTE)
-                    keyframe.remove(key)
+        for keyframe in self.root.findall("keyframe") if not keep_keys else ():
+            self._add_note("key frames of attached models")
+            self.root.remove(keyframe)
         for equality in self.root.findall("equality"):
             for element in [e for e in equality if e.tag not in SUPPORTED_EQUALITIES]:
                 self._add_note(f"equality <{element.tag}> {element.get('name', '')}".rstrip())

@@ -8,7 +8,7 @@ MuJoCo's values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,6 +31,7 @@ from ckc_pin.formats.urdf.elements import format_numbers, make_visual
 
 __all__ = ["MjcfTree", "Placed"]
 
+ASSEMBLED_KEY = "assembled"  # name of the key frame that `ckc export` writes
 JOINT_KINDS = ("free", "ball", "slide", "hinge")  # by mjtJoint
 SPHERE, CAPSULE, CYLINDER, BOX = 2, 3, 5, 6  # mjtGeom
 ORTHOGONAL_TOLERANCE = 1e-12  # between the axes of three slides
@@ -188,7 +189,10 @@ class MjcfTree:
     ref : dict of int to float
         By number, the joints of one freedom with their values in the reference pose, rad or m.
     q_guess : dict of str to float
-        The reference pose, or the key frame that `ckc export` writes: coordinates that are not zero.
+        The key frame "assembled" that `ckc export` writes, the first key frame, or the reference pose: coordinates that
+        are not zero.
+    key_frames : dict of str to (dict of str to float)
+        The other key frames by name.
     guessed, left_out : list of str
     """
 
@@ -199,13 +203,19 @@ class MjcfTree:
     bodies: list[Placed] = field(default_factory=list)
     ref: dict[int, float] = field(default_factory=dict)
     q_guess: dict[str, float] = field(default_factory=dict)
+    key_frames: dict[str, dict[str, float]] = field(default_factory=dict)
     guessed: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         model = self.model = self.compiled.model
         self._link_names, self._joint_names = {"world", *self.compiled.bodies}, set(self.compiled.joints)
-        self._start = model.key_qpos[0] if model.nkey else model.qpos0
+        names = [self.compiled.name("key", k) or f"key_{k}" for k in range(model.nkey)]
+        order = sorted(range(model.nkey), key=lambda k: names[k] != ASSEMBLED_KEY)
+        self._starts = [model.key_qpos[k] for k in order] or [model.qpos0]
+        configs = [self.q_guess, *({} for _ in order[1:])]
+        self.key_frames = {names[k]: config for k, config in zip(order[1:], configs[1:], strict=True)}
+        self._configs = configs
         self.links["world"] = Link()
         self.bodies.append(Placed("world", pin.SE3.Identity()))
         for body in range(1, model.nbody):
@@ -250,16 +260,22 @@ class MjcfTree:
         if [joint.kind for joint in joints] == ["free"]:
             if joints[0].nonzero_properties:
                 self.left_out.append(f"{', '.join(joints[0].nonzero_properties)} of free joint {joints[0].name}")
-            qpos = self._start[joints[0].qpos_index :]
-            pose = self._add_free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
+            first = joints[0].qpos_index
+
+            def read_pose(qpos: Array) -> pin.SE3:
+                return pin.SE3(from_quaternion(qpos[first + 3 : first + 7]), qpos[first : first + 3].copy())
+
+            pose = self._add_free(joints[0].name, name, read_pose)
         elif on_world and _is_free_root(joints) and not self.used_joints & {joint.number for joint in joints}:
             self.guessed.append(f"the three slides and the ball of body {name} are one free joint, 'root'")
             self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.has_stops]
-            qpos = self._start[joints[0].qpos_index :]
-            shift = sum(((x - j.ref) * j.axis for x, j in zip(qpos[:3], joints, strict=False)), np.zeros(3))
-            pose = self._add_free(
-                make_unique("root", self._joint_names), name, start.pose * pin.SE3(from_quaternion(qpos[3:7]), shift)
-            )
+            first = joints[0].qpos_index
+
+            def compose_pose(qpos: Array) -> pin.SE3:
+                shift = sum(((x - j.ref) * j.axis for x, j in zip(qpos[first:], joints[:3], strict=False)), np.zeros(3))
+                return start.pose * pin.SE3(from_quaternion(qpos[first + 3 : first + 7]), shift)
+
+            pose = self._add_free(make_unique("root", self._joint_names), name, compose_pose)
         else:
             pose = self._add_chain(joints, name, start)
         self.bodies.append(Placed(name, pose))
@@ -275,12 +291,16 @@ class MjcfTree:
 
     # --- joints ------------------------------------------------------------------------------------
 
-    def _add_free(self, name: str, body: str, start: pin.SE3) -> pin.SE3:
+    def _add_free(self, name: str, body: str, read_pose: Callable[[Array], pin.SE3]) -> pin.SE3:
         """Add a floating joint, whose coordinates are the body's world pose; return the body's pose in its link."""
         self._joint_names.add(name)
         self._add_joint(name, "floating", "world", body, pin.SE3.Identity())
-        values = (*start.translation, *pin.log3(start.rotation))
-        self._set_guess((f"{name}.{label}" for label in FREE_LABELS), values)
+
+        def read(qpos: Array) -> Iterable[Any]:
+            pose = read_pose(qpos)
+            return (*pose.translation, *pin.log3(pose.rotation))
+
+        self._set_guess([f"{name}.{label}" for label in FREE_LABELS], read)
         return pin.SE3.Identity()
 
     def _add_chain(self, joints: Sequence[_Joint], body: str, start: Placed) -> pin.SE3:
@@ -317,7 +337,7 @@ class MjcfTree:
         if joint.is_nonlinear:
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {joint.name}")
         self.ref[joint.number] = round_number(joint.ref)
-        self._set_guess([joint.name], [self._start[joint.qpos_index]])
+        self._set_guess([joint.name], lambda qpos: [qpos[joint.qpos_index]])
 
     def _add_ball(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
         """Add three hinges in series for a ball joint."""
@@ -325,15 +345,21 @@ class MjcfTree:
         self._joint_names.update(names)
         suffixes = [name.removeprefix(joint.name) for name in names]
         self._add_joint(joint.name, "ball", link, child, origin, ball_axes(suffixes))
-        rotation = from_quaternion(self._start[joint.qpos_index : joint.qpos_index + 4])
-        # The hinges turn about x, y and z in this order, so their angles are those of the inverse with opposite sign.
-        self._set_guess(names, [-angle for angle in to_rpy(rotation.T)])
+
+        def read(qpos: Array) -> Iterable[Any]:
+            # The hinges turn about x, y and z in this order: their angles are the inverse's with opposite sign.
+            rotation = from_quaternion(qpos[joint.qpos_index : joint.qpos_index + 4])
+            return [-angle for angle in to_rpy(rotation.T)]
+
+        self._set_guess(names, read)
         if joint.nonzero_properties:
             self.left_out.append(f"{', '.join(joint.nonzero_properties)} of ball joint {joint.name}")
 
-    def _set_guess(self, labels: Iterable[str], values: Iterable[Any]) -> None:
-        rounded = {label: round_number(float(x)) for label, x in zip(labels, values, strict=True)}
-        self.q_guess |= {label: x for label, x in rounded.items() if x != 0}
+    def _set_guess(self, labels: Sequence[str], read: Callable[[Array], Iterable[Any]]) -> None:
+        """Read coordinates from the values of qpos of each start."""
+        for config, qpos in zip(self._configs, self._starts, strict=True):
+            rounded = {label: round_number(float(x)) for label, x in zip(labels, read(qpos), strict=True)}
+            config |= {label: x for label, x in rounded.items() if x != 0 or config is not self.q_guess}
 
     def _add_joint(
         self, name: str, kind: JointKind, parent: str, child: str, origin: pin.SE3, axes: Sequence[JointAxis] = ()
