@@ -32,6 +32,7 @@ MAX_DEPTH = 20  # nested and included models
 READ = {  # other elements are left out with a note
     "sdf": {"model", "world", "include"},
     "world": {"model", "include", "gravity", "joint", "frame"},
+    "include": {"uri", "name", "pose", "static", "placement_frame"},
     "model": {"link", "joint", "frame", "model", "include", "pose", "static", "drake:ball_constraint", "plugin"},
     "link": {"pose", "inertial", "visual"},
     "joint": {
@@ -156,6 +157,7 @@ class _Reader:
         InputError
             The file does not exist in the repository, has no model, or includes itself.
         """
+        self._count_unread(element)
         uri = (element.findtext("uri") or "").strip()
         where = f"{path}: <include> {uri!r}"
         file = find_in_repository(uri, path, where, "model.sdf")

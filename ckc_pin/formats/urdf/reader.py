@@ -18,7 +18,7 @@ from ckc_pin.formats.urdf.closing_frames import find_closing_frames
 from ckc_pin.formats.urdf.elements import INERTIA_ENTRIES, parse_origin
 from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML, add_loop_closures_yaml
 from ckc_pin.formats.urdf.loops import LOOP_TAGS, add_gazebo, add_loops
-from ckc_pin.formats.urdf.motors import MOTOR_TAGS, add_motors
+from ckc_pin.formats.urdf.motors import MOTOR_TAGS, add_control_mimics, add_motors
 from ckc_pin.formats.urdf.robot_yaml import add_robot_yaml
 from ckc_pin.mechanism.urdf import by_name, check_single_elements, floats
 
@@ -84,6 +84,7 @@ def read_urdf(text: str, path: Path) -> Robot:
         if robot.loops or robot.untyped:
             robot.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
     _set_independent(robot, root)
+    add_control_mimics(robot, root)
     _check_mimics(robot)
     add_motors(robot, root, unread)
     robot.leave_out(unread)
