@@ -28,6 +28,7 @@ from ckc_pin.formats.sdf.reader import read_sdf
 from ckc_pin.formats.tree import make_draft
 from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML
 from ckc_pin.formats.urdf.reader import ROBOT_YAML, find_urdf_beside, read_urdf
+from ckc_pin.formats.urdf.xacro import expand_xacro, is_xacro
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.scene.names import DEFAULT, SUFFIX
@@ -78,12 +79,17 @@ def read_robot(path: Path) -> Robot:
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
     text = read_text(path, "robot file")
+    expanded = is_xacro(path, text)
+    if expanded:
+        text = expand_xacro(path)
     tag = parse_xml(text, str(path)).tag
     if tag not in READERS:
         raise InputError(
             f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF), <robot> (URDF) or <sdf> (SDFormat)"
         )
-    return READERS[tag](text, path)
+    robot = READERS[tag](text, path)
+    robot.origin += ", expanded by xacro" if expanded else ""
+    return robot
 
 
 def _remove_loops_within_a_body(draft: Draft) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ckc_pin.errors import InputError
 
-__all__ = ["find_in_repository", "repository_of", "resolve_links"]
+__all__ = ["find_folder", "find_in_repository", "repository_of", "resolve_links"]
 
 MAX_LEVELS = 2  # of folders above a model that belong to it, where no repository is found
 
@@ -27,6 +27,20 @@ def repository_of(folder: Path) -> Path:
             return candidate
     allowed = [candidate for candidate in above[: MAX_LEVELS + 1] if candidate not in excluded]
     return allowed[-1] if allowed else folder
+
+
+def find_folder(name: str, root: Path, model: Path) -> Path:
+    """Return the folder of a package inside a repository.
+
+    Raises
+    ------
+    InputError
+        The repository has no such folder.
+    """
+    choices = [folder for folder in (root, *sorted(root.glob("*")), *sorted(root.glob("*/*"))) if folder.name == name]
+    if not choices:
+        raise InputError(f"{model}: no package {name!r} in the model's repository {root.name!r}")
+    return choices[0]
 
 
 def resolve_links(path: Path) -> Path | None:

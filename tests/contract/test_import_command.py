@@ -215,7 +215,7 @@ CASES = [
         files=mjcf("", FINE),
     ),
     # URDF
-    Bad("a xacro", R, ["a xacro file", "expand it first"], files=urdf('<link name="${x}"/>')),
+    Bad("an unknown property", R, ["xacro cannot expand it", "'x'"], files=urdf('<link name="${x}"/>')),
     Bad("two roots", R, ["roots found: 'base', 'lost'"], files=urdf('<link name="lost"/>')),
     Bad(
         "unknown loop",

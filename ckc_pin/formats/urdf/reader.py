@@ -59,7 +59,6 @@ def read_urdf(text: str, path: Path) -> Robot:
         The text is not a valid URDF, or an element names a link or joint that does not exist.
     """
     root, source = parse_xml(text, str(path)), str(path)
-    _refuse_xacro(root, path)
     robot = Robot(name=choose_name(path, root.get("name", "")), origin=f"{path.name}, a URDF", source=source)
     robot.materials = root.findall("material")
     unread = Counter(f"<{e.tag}>" for e in root if e.tag not in READ["robot"])
@@ -118,14 +117,6 @@ def find_urdf_beside(path: Path) -> Path:
         names = ", ".join(p.name for p in urdfs) or "none"
         raise InputError(f"{path}: expected one URDF in the same folder, got {names}; import the URDF itself instead")
     return candidates[0]
-
-
-def _refuse_xacro(root: Element, path: Path) -> None:
-    for element in root.iter():
-        if "xacro" in element.tag or any("${" in value for value in element.attrib.values()):
-            raise InputError(
-                f"{path}: this is a xacro file, not a URDF; expand it first with `xacro FILE > robot.urdf`"
-            )
 
 
 # --- links and joints ----------------------------------------------------------------------------------------------
