@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -193,16 +193,7 @@ def mechanism_text(draft: Draft) -> str:
         lines += _name_list("actuated", spec.actuated)
     if draft.q_guess:
         lines += ["", "[q_guess]", *(f"{format_key(k)} = {format_value(float(v))}" for k, v in draft.q_guess.items())]
-    tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
-        "loop": draft.loops,
-        "coupling": draft.couplings,
-        "spring": draft.springs,
-        "force": draft.forces,
-        "joint": draft.joints,
-        "motor": draft.motors,
-        "point": draft.points,
-    }
-    for table, entries in tables.items():
+    for table, entries in draft.tables.items():
         for entry, comment in entries:
             lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
     if not draft.loops:

@@ -57,21 +57,11 @@ TEXT_ATTRIBUTES = {  # their text may look like a number
 
 @dataclass
 class _ModelFiles:
-    """Tokens for the files of a model and of the models that it attaches.
+    """Tokens for the files of a model and of the models that it attaches."""
 
-    Attributes
-    ----------
-    folder : Path
-        The model's repository. No file outside it is opened.
-    paths : dict of str to Path
-        Mesh file of each token. It need not exist.
-    models : int
-        Number of attached models so far.
-    """
-
-    folder: Path
-    paths: dict[str, Path] = field(default_factory=dict)
-    models: int = 0
+    folder: Path  # the model's repository; no file outside it is opened
+    paths: dict[str, Path] = field(default_factory=dict)  # mesh file of each token; it need not exist
+    models: int = 0  # number of attached models so far
 
     def add_mesh(self, path: Path) -> str:
         """Return a new token for a mesh file."""
@@ -85,26 +75,14 @@ class _ModelFiles:
         return f"model_{self.models}.xml"
 
     def resolve(self, folder: Path, file: str, where: str) -> Path:
-        """Return the path of a file, relative to a folder.
-
-        Raises
-        ------
-        InputError
-            The file is not in the model's repository.
-        """
+        """Return the path of a file, relative to a folder."""
         path = resolve_links(folder / file)
         if not file or path is None or not path.is_relative_to(self.folder):
             raise InputError(f"{where}: expected a file in the model's repository {self.folder.name!r}")
         return path
 
     def read_mesh(self, token: str) -> bytes | None:
-        """Return the content of a mesh file; None if it is not readable or not in the model's repository.
-
-        Raises
-        ------
-        InputError
-            The file is too large.
-        """
+        """Return the content of a mesh file; None if it is not readable or not in the model's repository."""
         path = resolve_links(self.paths[token])
         if path is None or not path.is_relative_to(self.folder):
             return None
@@ -122,13 +100,7 @@ class _ModelFiles:
 def _expand_includes(
     element: Element, folder: Path, files: _ModelFiles, seen: set[Path], source: str, depth: int = 0
 ) -> None:
-    """Replace each <include> by the content of its file. A file may be included once.
-
-    Raises
-    ------
-    InputError
-        A file is included twice, is not in the model's repository, or is not XML.
-    """
+    """Replace each <include> by the content of its file. A file may be included once."""
     if depth > MAX_XML_DEPTH:
         raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
     position = 0
@@ -151,38 +123,17 @@ def _expand_includes(
 
 @dataclass
 class Document:
-    """The prepared XML of a model, with its files and attached models.
+    """The prepared XML of a model, with its files and attached models."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the model in messages.
-    root : Element
-        <mujoco>, without any <include>.
-    files : _ModelFiles
-        Files of the model and of all models that it attaches.
-    models : dict of str to Document
-        Attached models by token.
-    left_out : list of str
-        Notes on removed elements that would change the motion.
-    """
-
-    source: str
-    root: Element
-    files: _ModelFiles
-    models: dict[str, Document] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    source: str  # name of the model in messages
+    root: Element  # <mujoco>, without any <include>
+    files: _ModelFiles  # of the model and of all models that it attaches
+    models: dict[str, Document] = field(default_factory=dict)  # attached models by token
+    left_out: list[str] = field(default_factory=list)  # removed elements that would change the motion
 
     @classmethod
     def read(cls, text: str, path: Path) -> Document:
-        """Parse and prepare a model, with the files that it includes and attaches.
-
-        Raises
-        ------
-        InputError
-            The XML is malformed, a file is outside the model's repository or included twice, a number is not finite, or
-            there are too many bodies.
-        """
+        """Parse and prepare a model, with the files that it includes and attaches."""
         document = cls._read(text, path.absolute(), str(path), _ModelFiles(repository_of(path.absolute().parent)), ())
         bodies, elements = document._count()
         if bodies > MAX_BODIES or elements > MAX_ELEMENTS:

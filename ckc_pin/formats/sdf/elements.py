@@ -31,13 +31,7 @@ JOINT_KINDS: dict[str, JointKind] = {
 
 
 def read_numbers(element: Element | None, tag: str, default: str, count: int, where: str) -> list[float]:
-    """Return the numbers of a child element; `tag` may be a path, and empty for the element itself.
-
-    Raises
-    ------
-    InputError
-        There are not `count` finite numbers.
-    """
+    """Return the numbers of a child element; `tag` may be a path, and empty for the element itself."""
     child = element if element is None or not tag else element.find(tag)
     text = default if child is None or not (child.text or "").strip() else (child.text or "")
     try:
@@ -138,11 +132,6 @@ def read_axes(element: Element, kind: str, rotate: Callable[[Element, Array], Ar
     rotate : callable
         Gets an <axis> and its direction as it is written, and returns the direction in the joint's frame.
     where : str
-
-    Raises
-    ------
-    InputError
-        An axis is missing or zero, or a number is malformed.
     """
     if kind in ("fixed", "ball"):
         return [] if kind == "fixed" else ball_axes()

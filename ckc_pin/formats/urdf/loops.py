@@ -43,13 +43,7 @@ OPPOSITE = 1e-12  # 1 + cosine of two axes that point against each other
 
 
 def add_loops(robot: Robot, root: Element) -> Iterator[str]:
-    """Add the loops and couplings of a URDF, and yield what they are called.
-
-    Raises
-    ------
-    InputError, MechanismError
-        A type is unknown, a link does not exist, a number is malformed, or a loop connects a link with itself.
-    """
+    """Add the loops and couplings of a URDF, and yield what they are called."""
     for tag, where_from in (("loop", "in generalized_rbda"), ("loop_joint", "in Drake's old format"),
                             ("constraint", "in urdfdom's proposal")):  # fmt: skip
         elements = root.findall(tag)
@@ -189,11 +183,6 @@ def add_gazebo(robot: Robot, root: Element, unread: Counter[str]) -> list[str]:
     """Add the joints, springs and couplings of <gazebo> elements, and return what they are called.
 
     Gazebo places a joint in its child, at the poses of the links at zero.
-
-    Raises
-    ------
-    InputError, MechanismError
-        A number is malformed, a type is unknown, or a link does not exist.
     """
     dialects = []
     for gazebo in root.findall("gazebo"):

@@ -22,11 +22,6 @@ def add_motors(robot: Robot, root: Element, unread: Counter[str]) -> None:
 
     A joint with several transmissions or interfaces has one motor. A mimic joint has none. The largest effort of a
     joint limits the torque of its motor.
-
-    Raises
-    ------
-    InputError
-        A reduction or rotor inertia is not a number, or a reduction is zero.
     """
     axes, driven, undriven = robot.axes, list[str](), list[str]()
     free = {name for name, axis in axes.items() if axis.mimic is None}

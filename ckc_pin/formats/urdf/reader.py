@@ -52,11 +52,6 @@ def read_urdf(text: str, path: Path) -> Robot:
     text : str
     path : Path
         File of the text. A robot.yaml or loop_closures.yaml in the same folder belongs to it.
-
-    Raises
-    ------
-    InputError, MechanismError
-        The text is not a valid URDF, or an element names a link or joint that does not exist.
     """
     root, source = parse_xml(text, str(path)), str(path)
     robot = Robot(name=choose_name(path, root.get("name", "")), origin=f"{path.name}, a URDF", source=source)
@@ -104,13 +99,7 @@ def read_urdf(text: str, path: Path) -> Robot:
 
 
 def find_urdf_beside(path: Path) -> Path:
-    """Return the URDF to which a robot.yaml or loop_closures.yaml belongs.
-
-    Raises
-    ------
-    InputError
-        The folder has no URDF, or several and none of them is robot.urdf.
-    """
+    """Return the URDF to which a robot.yaml or loop_closures.yaml belongs."""
     urdfs = sorted(path.parent.glob("*.urdf"))
     candidates = [p for p in urdfs if p.name == "robot.urdf"] or urdfs
     if len(candidates) != 1:

@@ -28,13 +28,7 @@ def is_xacro(path: Path, text: str) -> bool:
 
 
 def expand_xacro(path: Path) -> str:
-    """Return the XML that a xacro file describes, with the default values of its arguments.
-
-    Raises
-    ------
-    InputError
-        xacro is not installed, the file is malformed, a file or argument is missing, or an expression is refused.
-    """
+    """Return the XML that a xacro file describes, with the default values of its arguments."""
     try:
         import xacro
         from xacro import substitution_args
