@@ -100,6 +100,7 @@ class Draft(Tables):
 def choose_independent(draft: Draft) -> None:
     """Set `draft.independent`: the file's choice if it determines the configuration, otherwise the actuated joints.
 
+    The actuated joints alone are tried first, because the assembly then keeps their values.
     A draft that cannot be assembled is not changed, because the user needs the file's choice to correct its loops.
     """
     if draft.independent is not None:
@@ -116,10 +117,12 @@ def choose_independent(draft: Draft) -> None:
             reason = str(error).removeprefix(f"{draft.name}: ").removeprefix("independent: ")
             draft.guessed.append(f"independent is chosen by the program; the file's choice does not work: {reason}")
     elif draft.actuated and (draft.loops or draft.couplings):
-        mechanism = _try_to_build(draft)
-        if mechanism is None:
+        draft.independent, draft.why_independent = [*draft.actuated], "the actuated joints"
+        if _try_to_build(draft) is not None:
             return
-        names = list(mechanism.independent)
+        draft.independent, draft.why_independent = None, ""
+        mechanism = _try_to_build(draft)
+        names = [] if mechanism is None else list(mechanism.independent)
         if not set(draft.actuated) <= set(names):
             return
         draft.independent = names
