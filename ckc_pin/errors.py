@@ -13,6 +13,8 @@
 Every message says where the error is, what is wrong, and what would be right. On the command line the first
 two end with exit code 2, before the first step. The third ends with exit code 3, and everything computed so
 far is kept and printed.
+
+`ImportNote` is a warning: what was guessed and left out of a file that was imported in memory.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ckc_pin.run.run import Run
 
-__all__ = ["CkcError", "InputError", "MechanismError", "NumericalError"]
+__all__ = ["CkcError", "ImportNote", "InputError", "MechanismError", "NumericalError"]
 
 
 class CkcError(Exception):
@@ -51,6 +53,10 @@ class MechanismError(CkcError):
 
 class InputError(CkcError, ValueError):
     """An argument or a file is invalid, found before any computation."""
+
+
+class ImportNote(UserWarning):
+    """What was guessed and left out of a file in another program's format that was imported in memory."""
 
 
 class NumericalError(CkcError):

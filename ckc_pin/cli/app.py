@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+import warnings
 from importlib import import_module
 
 import click
@@ -12,7 +13,7 @@ import click
 import ckc_pin
 from ckc_pin.cli.output import error_console, has_printed_json, print_json, reset_json
 from ckc_pin.cli.signals import DONE, STOPPED, WRONG_INPUT, interrupt_code, interrupts
-from ckc_pin.errors import CkcError, NumericalError
+from ckc_pin.errors import CkcError, ImportNote, NumericalError
 
 __all__ = ["ckc", "main"]
 
@@ -118,10 +119,16 @@ def main() -> int:
     return code
 
 
+def _print_warning(message: Warning | str, *_: object, **__: object) -> None:
+    error_console().print(f"note: {message}", markup=False, highlight=False)
+
+
 def _run_command(as_json: bool) -> int:
     """Run the command line, print its error if there is one, and return the exit code."""
     try:
-        with ckc.make_context("ckc", sys.argv[1:]) as context:
+        with warnings.catch_warnings(), ckc.make_context("ckc", sys.argv[1:]) as context:
+            warnings.simplefilter("always", ImportNote)
+            warnings.showwarning = _print_warning
             ckc.invoke(context)
         sys.stdout.flush()
     except click.exceptions.Exit as exit_:

@@ -55,7 +55,12 @@ def make_frame(link: str, pose: pin.SE3) -> Frame:
 def choose_name(path: Path, declared: str = "") -> str:
     """Name a mechanism after its file, or after its folder or its declared name where the file's name is generic."""
     folders = path.absolute().parents
-    for candidate in (path.stem, folders[0].name, declared, folders[min(1, len(folders) - 1)].name):
+    for candidate in (
+        path.stem.removesuffix(".urdf").removesuffix(".sdf"),
+        folders[0].name,
+        declared,
+        folders[min(1, len(folders) - 1)].name,
+    ):
         cleaned = re.sub(r"[^\w-]+", "_", candidate).strip("_-")[:MAX_NAME_CHARACTERS]
         if cleaned and cleaned.lower() not in GENERIC_NAMES:
             return cleaned
@@ -108,7 +113,7 @@ def require_direction(values: Iterable[float], where: str) -> np.ndarray[tuple[i
 # --- rotations -----------------------------------------------------------------------------------------------------
 
 
-def from_quaternion(quaternion: Sequence[float]) -> Array:
+def from_quaternion(quaternion: Sequence[float] | Array) -> Array:
     """Return the rotation matrix of a quaternion (w, x, y, z), which need not be normalized."""
     return np.array(pin.Quaternion(*map(float, quaternion)).normalized().matrix())
 

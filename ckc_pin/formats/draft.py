@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
 import pinocchio as pin
 
 from ckc_pin.base.sources import Sources
@@ -22,21 +25,10 @@ __all__ = ["Draft", "choose_independent"]
 
 @dataclass(kw_only=True)
 class Draft(Tables):
-    """A mechanism with the files' content. `ckc_pin.formats.tree` makes it of a `Robot`.
+    """A mechanism with the content of its files. `ckc_pin.formats.tree` makes it of a `Robot`."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the imported file in messages.
-    robot : Element
-        The tree as a URDF's <robot>.
-    joints : list of (JointSpec, comment)
-        Armatures and stops, which a URDF cannot express.
-    """
-
-    source: str
-    robot: ElementTree.Element
-    joints: WithComment[JointSpec] = field(default_factory=list)
+    robot: ElementTree.Element  # the tree as a URDF's <robot>
+    joints: WithComment[JointSpec] = field(default_factory=list)  # armatures and stops, which a URDF cannot express
 
     @property
     def urdf_file(self) -> str:
@@ -50,6 +42,7 @@ class Draft(Tables):
 
     def to_spec(self) -> MechanismSpec:
         """Return the content of ``mechanism.toml`` as typed structures."""
+        tables: dict[str, Any] = {name: [spec for spec, _ in entries] for name, entries in self.tables.items()}
         return MechanismSpec(
             name=self.name,
             urdf=self.urdf_file,
@@ -57,14 +50,21 @@ class Draft(Tables):
             independent=self.independent,
             actuated=None if self.motors else self.actuated,
             q_guess=self.q_guess,
-            loop=[spec for spec, _ in self.loops],
-            coupling=[spec for spec, _ in self.couplings],
-            spring=[spec for spec, _ in self.springs],
-            force=[spec for spec, _ in self.forces],
-            joint=[spec for spec, _ in self.joints],
-            motor=[spec for spec, _ in self.motors],
-            point=[spec for spec, _ in self.points],
+            **tables,
         )
+
+    @property
+    def tables(self) -> dict[str, Sequence[tuple[msgspec.Struct, str]]]:
+        """Tables of ``mechanism.toml`` with their comments, in the order in which they are written."""
+        return {
+            "loop": self.loops,
+            "coupling": self.couplings,
+            "spring": self.springs,
+            "force": self.forces,
+            "joint": self.joints,
+            "motor": self.motors,
+            "point": self.points,
+        }
 
     def build_tree(self) -> tuple[Tree, Frames, UrdfTree]:
         """Build the tree without its loops, and return it with its frames and the checked URDF.
@@ -100,6 +100,7 @@ class Draft(Tables):
 def choose_independent(draft: Draft) -> None:
     """Set `draft.independent`: the file's choice if it determines the configuration, otherwise the actuated joints.
 
+    The actuated joints alone are tried first, because the assembly then keeps their values.
     A draft that cannot be assembled is not changed, because the user needs the file's choice to correct its loops.
     """
     if draft.independent is not None:
@@ -116,10 +117,12 @@ def choose_independent(draft: Draft) -> None:
             reason = str(error).removeprefix(f"{draft.name}: ").removeprefix("independent: ")
             draft.guessed.append(f"independent is chosen by the program; the file's choice does not work: {reason}")
     elif draft.actuated and (draft.loops or draft.couplings):
-        mechanism = _try_to_build(draft)
-        if mechanism is None:
+        draft.independent, draft.why_independent = [*draft.actuated], "the actuated joints"
+        if _try_to_build(draft) is not None:
             return
-        names = list(mechanism.independent)
+        draft.independent, draft.why_independent = None, ""
+        mechanism = _try_to_build(draft)
+        names = [] if mechanism is None else list(mechanism.independent)
         if not set(draft.actuated) <= set(names):
             return
         draft.independent = names

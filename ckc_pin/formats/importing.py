@@ -7,16 +7,18 @@ them, by pairs of closing frames, or not at all.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
 
 from ckc_pin.base.sources import parse_xml, write_texts
 from ckc_pin.base.toml import read_text
 from ckc_pin.base.toml_writer import LINE_WIDTH, format_key, format_value, to_table
-from ckc_pin.errors import InputError
+from ckc_pin.errors import ImportNote, InputError, printable
+from ckc_pin.formats.conversion import make_unique
 from ckc_pin.formats.draft import Draft, choose_independent
 from ckc_pin.formats.loop_types import propose_loop_types
 from ckc_pin.formats.mjcf.reader import read_mjcf
@@ -26,12 +28,15 @@ from ckc_pin.formats.sdf.reader import read_sdf
 from ckc_pin.formats.tree import make_draft
 from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML
 from ckc_pin.formats.urdf.reader import ROBOT_YAML, find_urdf_beside, read_urdf
+from ckc_pin.formats.urdf.xacro import expand_xacro, is_xacro
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import LoopType
+from ckc_pin.scene.names import DEFAULT, SUFFIX
 
-__all__ = ["Draft", "mechanism_text", "read", "read_robot", "write"]
+__all__ = ["Draft", "draft_texts", "import_texts", "mechanism_text", "read", "read_robot", "write"]
 
 LOOP_TYPES = get_args(LoopType)
+SCENE_SECONDS = 1.0  # of free motion in the scenes that import writes
 READERS = {"mujoco": read_mjcf, "robot": read_urdf, "sdf": read_sdf}  # by the root element
 
 
@@ -74,12 +79,17 @@ def read_robot(path: Path) -> Robot:
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
     text = read_text(path, "robot file")
+    expanded = is_xacro(path, text)
+    if expanded:
+        text = expand_xacro(path)
     tag = parse_xml(text, str(path)).tag
     if tag not in READERS:
         raise InputError(
             f"{path}: the root element is <{tag}>; expected <mujoco> (MJCF), <robot> (URDF) or <sdf> (SDFormat)"
         )
-    return READERS[tag](text, path)
+    robot = READERS[tag](text, path)
+    robot.origin += ", expanded by xacro" if expanded else ""
+    return robot
 
 
 def _remove_loops_within_a_body(draft: Draft) -> None:
@@ -99,7 +109,7 @@ def _remove_loops_within_a_body(draft: Draft) -> None:
 
 
 def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write ``mechanism.toml`` and the URDF of a draft.
+    """Write ``mechanism.toml``, the URDF and the scenes of a draft: free motion, and one for each further key frame.
 
     Parameters
     ----------
@@ -119,8 +129,50 @@ def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
     InputError
         A file exists already, or the folder is not writable.
     """
+    return write_texts(folder, draft_texts(draft), overwrite)
+
+
+def draft_texts(draft: Draft) -> dict[str, str]:
+    """Return the texts of ``mechanism.toml``, the URDF and the scenes by file name, ``mechanism.toml`` first."""
     texts = {MECHANISM_FILE: mechanism_text(draft), draft.urdf_file: draft.urdf_text()}
-    return write_texts(folder, texts, overwrite)
+    texts[f"{DEFAULT}{SUFFIX}"] = _scene_text("the assembled configuration", {"at": "assembled"})
+    for name, config in draft.key_frames.items():
+        file = make_unique(re.sub(r"[^\w-]+", "_", name), [text.removesuffix(SUFFIX) for text in texts])
+        texts[f"{file}{SUFFIX}"] = _scene_text(f"key frame {name!r} of the imported file", {"q": config})
+    return texts
+
+
+def _scene_text(start: str, initial: dict[str, Any]) -> str:
+    """Return the text of a scene without control."""
+    lines = [*_comment(f"Free motion from {start}."), f"mechanism = {format_value(MECHANISM_FILE)}"]
+    lines += [
+        f"formulation = {format_value('reduced')}",
+        f"t_end = {SCENE_SECONDS}",
+        "",
+        "[initial]",
+        f"at = {format_value('assembled')}",
+    ]
+    if config := initial.get("q"):
+        values = ", ".join(f"{format_key(key)} = {format_value(float(x))}" for key, x in config.items())
+        lines[-1] = f"q = {{{values}}}"
+    return "\n".join(lines) + "\n"
+
+
+def import_texts(path: Path) -> dict[str, str]:
+    """Import a file in memory: return the texts that `write` would write. The notes are a warning.
+
+    Raises
+    ------
+    InputError, MechanismError
+        As in `read`.
+    """
+    draft = read(path)
+    notes = [f"warning: {note}" for note in draft.warnings] + [f"guessed: {note}" for note in draft.guessed]
+    notes += [f"left out: {note}" for note in draft.left_out]
+    warnings.warn(
+        "\n  ".join(map(printable, [f"{path} is imported as {draft.origin}", *notes])), ImportNote, stacklevel=2
+    )
+    return draft_texts(draft)
 
 
 def mechanism_text(draft: Draft) -> str:
@@ -141,16 +193,7 @@ def mechanism_text(draft: Draft) -> str:
         lines += _name_list("actuated", spec.actuated)
     if draft.q_guess:
         lines += ["", "[q_guess]", *(f"{format_key(k)} = {format_value(float(v))}" for k, v in draft.q_guess.items())]
-    tables: dict[str, Sequence[tuple[msgspec.Struct, str]]] = {
-        "loop": draft.loops,
-        "coupling": draft.couplings,
-        "spring": draft.springs,
-        "force": draft.forces,
-        "joint": draft.joints,
-        "motor": draft.motors,
-        "point": draft.points,
-    }
-    for table, entries in tables.items():
+    for table, entries in draft.tables.items():
         for entry, comment in entries:
             lines += ["", *_comment(comment), f"[[{table}]]", *_entries(entry)]
     if not draft.loops:

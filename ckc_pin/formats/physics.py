@@ -18,13 +18,7 @@ REMEDY = "correct the file, or import with --repair, which"
 
 
 def check_physics(robot: Robot, repair: bool) -> None:
-    """Refuse masses and inertias that no body has, and ranges with lower above upper; or repair them with a note.
-
-    Raises
-    ------
-    MechanismError
-        A body or range is impossible, and `repair` is False.
-    """
+    """Refuse masses and inertias that no body has, and ranges with lower above upper; or repair them with a note."""
     for name, link in robot.links.items():
         where, body = f"{robot.source}: link {name!r}", link.body
         if body.mass < 0:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ckc_pin.errors import InputError
 
-__all__ = ["find_in_repository", "repository_of", "resolve_links"]
+__all__ = ["find_folder", "find_in_repository", "repository_of", "resolve_links"]
 
 MAX_LEVELS = 2  # of folders above a model that belong to it, where no repository is found
 
@@ -29,6 +29,14 @@ def repository_of(folder: Path) -> Path:
     return allowed[-1] if allowed else folder
 
 
+def find_folder(name: str, root: Path, model: Path) -> Path:
+    """Return the folder of a package inside a repository. It must exist."""
+    choices = [folder for folder in (root, *sorted(root.glob("*")), *sorted(root.glob("*/*"))) if folder.name == name]
+    if not choices:
+        raise InputError(f"{model}: no package {name!r} in the model's repository {root.name!r}")
+    return choices[0]
+
+
 def resolve_links(path: Path) -> Path | None:
     """Return a path without symbolic links; None if these form a cycle."""
     try:
@@ -40,41 +48,21 @@ def resolve_links(path: Path) -> Path | None:
 def find_in_repository(uri: str, model: Path, where: str, default: str = "") -> Path:
     """Return a file that a model names by a relative path, ``model://NAME/PATH`` or ``package://NAME/PATH``.
 
-    Parameters
-    ----------
-    uri : str
-    model : Path
-        File of the model.
-    where : str
-        Beginning of a message.
-    default : str
-        File to take in a folder.
-
-    Raises
-    ------
-    InputError
-        There is no such file in the model's repository.
+    `default` is the file to take in a folder. The file must exist in the model's repository.
     """
     scheme, _, rest = uri.rpartition("://")
     folder = model.absolute().parent
     root = repository_of(folder)
-    tails = [Path(rest)] if not scheme else [Path(rest), Path(*Path(rest).parts[1:])]
-    bases = (
-        [folder]
-        if not scheme
-        else [b for b in (folder, *folder.resolve().parents) if b == folder or b.is_relative_to(root)]
-    )
-    for base in bases:
-        for tail in tails:
-            path = resolve_links(base / tail)
-            if path is None or not path.is_relative_to(root):
-                continue
-            if path.is_dir() and default and (path / default).is_file():
-                return path / default
-            if path.is_file():
-                return path
-    for depth in ("*", "*/*") if scheme and rest and ".." not in rest else ():
-        for path in sorted(root.glob(f"{depth}/{rest}{f'/{default}' if default and not Path(rest).suffix else ''}")):
-            if path.is_file() and path.resolve().is_relative_to(root):
-                return path
+    candidates = [folder / rest]
+    if scheme:
+        below = "/".join(Path(rest).parts[1:])
+        bases = [base for base in (folder, *folder.resolve().parents) if base == folder or base.is_relative_to(root)]
+        candidates = [base / tail for base in bases for tail in (rest, below) if tail]
+        candidates += [
+            path for depth in ("*", "*/*") if rest and ".." not in rest for path in sorted(root.glob(f"{depth}/{rest}"))
+        ]
+    for candidate in candidates:
+        path = resolve_links(candidate / default if default and candidate.is_dir() else candidate)
+        if path is not None and path.is_relative_to(root) and path.is_file():
+            return path
     raise InputError(f"{where}: no such file in the model's repository {root.name!r}")

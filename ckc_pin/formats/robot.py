@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 from xml.etree.ElementTree import Element
@@ -81,36 +81,19 @@ UNLIMITED = JointLimits()
 
 @dataclass
 class JointAxis:
-    """One freedom of a joint.
+    """One freedom of a joint."""
 
-    Attributes
-    ----------
-    direction : (3,) array
-        Unit vector in the joint's frame.
-    slides : bool
-        Whether the joint slides along the axis, instead of turning about it.
-    limits : JointLimits
-    damping, friction, armature : float
-    stiffness, rest : float
-        Spring, and the position at which it has no force.
-    stops : bool
-        Whether the limits are stops.
-    mimic : (joint, ratio, offset) tuple, optional
-    suffix : str
-        Ending of the coordinate's name, if the joint has several axes.
-    """
-
-    direction: Array
-    slides: bool = False
+    direction: Array  # unit vector in the joint's frame
+    slides: bool = False  # along the axis, instead of turning about it
     limits: JointLimits = UNLIMITED
     damping: float = 0.0
     friction: float = 0.0
     armature: float = 0.0
     stiffness: float = 0.0
-    rest: float = 0.0
-    stops: bool = False
+    rest: float = 0.0  # where the spring has no force
+    stops: bool = False  # whether the limits are stops
     mimic: Mimic | None = None
-    suffix: str = ""
+    suffix: str = ""  # ending of the coordinate's name, if the joint has several axes
 
     @property
     def has_forces(self) -> bool:
@@ -129,36 +112,18 @@ class JointAxis:
 
 @dataclass
 class Joint:
-    """A joint between two links: the frames that coincide at zero, and its axes in the order from parent to child.
-
-    Attributes
-    ----------
-    name : str
-    kind : str
-    parent, child : str
-        Links.
-    in_parent, in_child : SE3
-        The joint's frame in both links.
-    axes : list of JointAxis
-        A ball has three hinges about x, y and z.
-    pitch : float
-        Advance per turn of a screw, m/rad. Its axes are a hinge and a slide.
-    closes : bool
-        Whether the file declares it as the closure of a loop. It is cut first.
-    comment : str
-        On the loop, if the joint is cut.
-    """
+    """A joint between two links: the frames that coincide at zero, and its axes in the order from parent to child."""
 
     name: str
     kind: JointKind
     parent: str
     child: str
-    in_parent: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    in_parent: pin.SE3 = field(default_factory=pin.SE3.Identity)  # the joint's frame in both links
     in_child: pin.SE3 = field(default_factory=pin.SE3.Identity)
-    axes: list[JointAxis] = field(default_factory=list)
-    pitch: float = 0.0
-    closes: bool = False
-    comment: str = ""
+    axes: list[JointAxis] = field(default_factory=list)  # a ball has three hinges about x, y and z
+    pitch: float = 0.0  # advance of a screw, m/rad; its axes are a hinge and a slide
+    closes: bool = False  # whether the file declares it as the closure of a loop, which is cut first
+    comment: str = ""  # on the loop, if the joint is cut
 
     @classmethod
     def between(
@@ -190,86 +155,39 @@ class Joint:
 
 @dataclass(kw_only=True)
 class Tables:
-    """What a robot has besides its links and joints: tables of ``mechanism.toml``, and notes for the user.
+    """What a robot has besides its links and joints: tables of ``mechanism.toml``, and notes for the user."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the mechanism, and of its URDF.
-    origin : str
-        The file that was imported and its format. The first line of ``mechanism.toml`` quotes it.
-    loops, couplings, springs, forces, motors, points : list of (spec, comment)
-        Tables of ``mechanism.toml``. Frames are relative to the frames of the robot's links.
-    untyped : list of LoopSpec
-        Points that the file marks as coincident without the type of the joint, which is proposed from the geometry.
-    independent, actuated : list of str or None
-        None: the program chooses them. `actuated` also lists the joints of `motors`.
-    why_independent : str
-        Comment on `independent`.
-    gravity : (3,) tuple
-        m/s^2.
-    q_guess : dict of str to float
-        Start of the assembly by coordinate, rad or m.
-    key_frames : dict of str to (dict of str to float)
-        Further configurations by name.
-    guessed : list of str
-        What the file does not say, and what was assumed.
-    left_out : list of str
-        Content of the file that the mechanism does not have.
-    warnings : list of str
-        Why the mechanism has other freedoms than the file means.
-    """
-
-    name: str
-    origin: str
-    loops: WithComment[LoopSpec] = field(default_factory=list)
+    name: str  # of the mechanism and its URDF
+    origin: str  # the file and its format
+    source: str  # name of the file in messages
+    loops: WithComment[LoopSpec] = field(default_factory=list)  # frames are relative to those of the robot's links
     couplings: WithComment[CouplingSpec] = field(default_factory=list)
     springs: WithComment[SpringSpec] = field(default_factory=list)
     forces: WithComment[ForceSpec] = field(default_factory=list)
     motors: WithComment[MotorSpec] = field(default_factory=list)
     points: WithComment[PointSpec] = field(default_factory=list)
-    untyped: list[LoopSpec] = field(default_factory=list)
-    independent: list[str] | None = None
-    actuated: list[str] | None = None
-    why_independent: str = ""
+    untyped: list[LoopSpec] = field(default_factory=list)  # coincident points, whose joint the file does not give
+    independent: list[str] | None = None  # None: the program chooses them
+    actuated: list[str] | None = None  # also the joints of `motors`
+    why_independent: str = ""  # comment on `independent`
     gravity: Vector3 = (0.0, 0.0, -9.81)
-    q_guess: dict[str, float] = field(default_factory=dict)
-    key_frames: dict[str, dict[str, float]] = field(default_factory=dict)
-    guessed: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    q_guess: dict[str, float] = field(default_factory=dict)  # start of the assembly by coordinate
+    key_frames: dict[str, dict[str, float]] = field(default_factory=dict)  # other configurations by name
+    guessed: list[str] = field(default_factory=list)  # what the file does not say, and what was assumed
+    left_out: list[str] = field(default_factory=list)  # content of the file that the mechanism does not have
+    warnings: list[str] = field(default_factory=list)  # why it has other freedoms than the file means
 
 
 @dataclass(kw_only=True)
 class Robot(Tables):
-    """A robot as a reader understood it. Joints may form loops.
+    """A robot as a reader understood it. Joints may form loops."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the file in messages.
-    links : dict of str to Link
-    joints : dict of str to Joint
-    base : str
-        The link at which the tree begins; empty: the link that is no joint's child.
-    materials : list of Element
-        <material> elements that the links' shapes name.
-    """
-
-    source: str
     links: dict[str, Link] = field(default_factory=dict)
     joints: dict[str, Joint] = field(default_factory=dict)
-    base: str = ""
-    materials: list[Element] = field(default_factory=list)
+    materials: list[Element] = field(default_factory=list)  # <material> elements that the links' shapes name
 
     def add_joint(self, joint: Joint) -> None:
-        """Add a joint.
-
-        Raises
-        ------
-        MechanismError
-            Its name is taken, a link does not exist, or it connects a link with itself.
-        """
+        """Add a joint."""
         where = f"{self.source}: joint {joint.name!r}"
         if joint.name in self.joints:
             raise MechanismError(f"{self.source}: two joints are called {joint.name!r}")
@@ -303,9 +221,19 @@ class Robot(Tables):
             for name, axis in zip(joint.coordinates, joint.axes, strict=True)
         }
 
-    def moving_joints(self) -> Iterator[Joint]:
-        """Yield the joints that are not fixed."""
-        yield from (joint for joint in self.joints.values() if joint.kind != "fixed")
+    def distances(self, start: str) -> dict[str, int]:
+        """Return the numbers of joints from a link to the links that joints connect with it."""
+        neighbours: dict[str, list[str]] = {name: [] for name in self.links}
+        for joint in self.joints.values():
+            neighbours[joint.parent].append(joint.child)
+            neighbours[joint.child].append(joint.parent)
+        distance, pending = {start: 0}, [start]
+        for link in pending:
+            for other in neighbours[link]:
+                if other not in distance:
+                    distance[other] = distance[link] + 1
+                    pending.append(other)
+        return distance
 
     def zero_poses(self) -> dict[str, pin.SE3]:
         """Return the poses of the links at zero, relative to the base, without the joints that close loops."""
@@ -328,11 +256,10 @@ class Robot(Tables):
         return poses
 
     def find_base(self) -> str:
-        """Return the link at which the tree begins: `base`, "world", or the first link that is no joint's child."""
+        """Return the link at which the tree begins: "world", or the first link that is no joint's child."""
         children = {joint.child for joint in self.joints.values() if not joint.closes}
         roots = [name for name in self.links if name not in children]
-        choices = [self.base, *(["world"] if "world" in roots else []), *roots, *self.links]
-        return next(name for name in choices if name)
+        return "world" if "world" in roots else next(iter((*roots, *self.links)))
 
 
 def ball_axes(suffixes: Sequence[str] = ("_x", "_y", "_z")) -> list[JointAxis]:

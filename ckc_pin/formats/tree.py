@@ -38,33 +38,20 @@ HAS_FORCES, HAS_LIMITS, IS_RIGID, IS_PLAIN, CLOSES = 4, 3, 2, 1, 0  # how much i
 
 
 def make_draft(robot: Robot) -> Draft:
-    """Return a robot as a tree with loop closures.
-
-    Raises
-    ------
-    MechanismError
-        Links are not connected, or two joints close a loop between the same two links.
-    """
+    """Return a robot as a tree with loop closures."""
     return _Tree(robot).draft()
 
 
 class _Tree:
-    """The spanning tree of a robot.
-
-    Attributes
-    ----------
-    offset : dict of str to SE3
-        Frame of each link of the robot, in the frame of the URDF's link. A URDF's link has the frame of its joint.
-    joints : dict of str to Joint
-        Joints of the tree, directed away from the base.
-    """
+    """The spanning tree of a robot."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.links = dict(robot.links)
         self.loops: list[tuple[LoopSpec, str]] = []
+        # Frame of each link of the robot in the frame of the URDF's link, which is the frame of its joint.
         self.offset = {robot.find_base(): pin.SE3.Identity()}
-        self.joints: dict[str, Joint] = {}
+        self.joints: dict[str, Joint] = {}  # of the tree, directed away from the base
         self.guessed: list[str] = []
         self._check_pairs()
         distance = self._distances()
@@ -78,9 +65,9 @@ class _Tree:
     # --- choice of the tree ------------------------------------------------------------------------
 
     def _check_pairs(self) -> None:
-        closing: dict[frozenset[str], Joint] = {}
-        for joint in self.robot.moving_joints():
-            other = closing.setdefault(frozenset((joint.parent, joint.child)), joint)
+        pairs: dict[frozenset[str], Joint] = {}
+        for joint in (joint for joint in self.robot.joints.values() if joint.kind != "fixed"):
+            other = pairs.setdefault(frozenset((joint.parent, joint.child)), joint)
             if other is not joint:
                 raise MechanismError(
                     f"{self.robot.source}: joints {other.name!r} and {joint.name!r} both connect links "
@@ -88,36 +75,16 @@ class _Tree:
                 )
 
     def _distances(self) -> dict[str, int]:
-        """Return the number of joints from the base to each link.
-
-        Raises
-        ------
-        MechanismError
-            A link is not connected with the base.
-        """
-        neighbours: dict[str, list[str]] = {name: [] for name in self.links}
-        for joint in self.robot.joints.values():
-            neighbours[joint.parent].append(joint.child)
-            neighbours[joint.child].append(joint.parent)
-
-        def spread(start: str) -> dict[str, int]:
-            distance, pending = {start: 0}, [start]
-            for link in pending:
-                for other in neighbours[link]:
-                    if other not in distance:
-                        distance[other] = distance[link] + 1
-                        pending.append(other)
-            return distance
-
+        """Return the number of joints from the base to each link. All links must be connected with it."""
         (base,) = self.offset
-        distance = spread(base)
+        distance = self.robot.distances(base)
         if len(distance) < len(self.links):
             lost = [name for name in self.links if name not in distance]
             children = {joint.child for joint in self.robot.joints.values()}
-            roots = [name for name in lost if name not in children] or lost[:1]
+            roots = [base, *([name for name in lost if name not in children] or lost[:1])]
             raise MechanismError(
-                f"{self.robot.source}: links are not connected; roots found: {', '.join(map(repr, [base, *roots]))}; "
-                "a joint has to connect them"
+                f"{self.robot.source}: links are not connected; roots found: {', '.join(map(repr, roots))}; a joint "
+                "has to connect them"
             )
         return distance
 
@@ -201,7 +168,7 @@ class _Tree:
         for name, link in self.links.items():
             self._add_link(xml, name, link)
         tables = {field.name: copy(getattr(robot, field.name)) for field in fields(Tables)}
-        draft = Draft(**tables, source=robot.source, robot=xml)
+        draft = Draft(**tables, robot=xml)
         draft.guessed += self.guessed
         draft.springs = []
         for joint in self.joints.values():

@@ -75,7 +75,7 @@ def load(
     ----------
     name : str, Path or GeneratorSpec
         For example ``"five_bar"`` or ``"robots/mine/mechanism.toml"``. ``"n_four_bar"`` is generated with its default
-        number of links.
+        number of links. A file in the format of another program is imported in memory, with its notes as a warning.
     overrides : mapping, optional
         Parameter values by name that replace those of the files, such as ``{"link.link_2.mass": 0.3}``.
     prescribed : mapping, optional

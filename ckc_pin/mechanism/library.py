@@ -14,6 +14,7 @@ import msgspec
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import convert, read_text
 from ckc_pin.errors import InputError
+from ckc_pin.mechanism.foreign import is_foreign, read_foreign
 
 __all__ = [
     "GENERATORS",
@@ -223,5 +224,8 @@ def read_mechanism_texts(name: str | Path | GeneratorSpec) -> tuple[str, Sources
         return generate(name)
     if name in GENERATORS and not is_path(str(name)):
         return generate(convert({"generator": name}, GeneratorSpec, str(name)))
+    if is_foreign(name):
+        sources = read_foreign(Path(name))
+        return sources.text(MECHANISM_FILE), sources
     path = mechanism_file(name)
     return read_text(path, "mechanism file"), Sources(str(path), path.parent)

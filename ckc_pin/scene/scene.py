@@ -28,6 +28,7 @@ from ckc_pin.control.spec import ControllerSpec, JointServoSpec, SampledSpec, Se
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.files import mechanism_sources
+from ckc_pin.mechanism.foreign import is_foreign, read_foreign
 from ckc_pin.mechanism.library import (
     MECHANISM_FILE,
     GeneratorSpec,
@@ -372,7 +373,8 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     Parameters
     ----------
     name : str or Path
-        ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path.
+        ``"five_bar/tracking"``, ``"five_bar"`` (its default scene), or a path. A file in the format of another program
+        is imported in memory, with its notes as a warning, and moves freely from its assembled configuration.
     overrides : mapping, optional
         Values by dotted key, e.g. ``{"solver.rtol": 1e-10}``, and by the names of the mechanism's parameters, e.g.
         ``{"link.link_2.mass": 0.3}``.
@@ -389,6 +391,11 @@ def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> 
     require_type(name, (str, Path), "load_scene: name", "a scene's shipped name or its path")
     if overrides is not None:
         require_table(overrides, "load_scene: overrides", EXPECTED_OVERRIDES)
+    if is_foreign(name):
+        sources = read_foreign(Path(name))
+        data = read_toml(sources.text(f"{DEFAULT}{SUFFIX}"), sources.name)
+        scene_data = apply_overrides(data, overrides or {})
+        return make_scene(scene_data, Path(name).stem, sources, sources.with_texts({}))
     path = find_scene_file(name)
     source = str(path) if isinstance(name, Path) or is_path(name) else name
     data = read_toml(read_text(path, "scene"), source)

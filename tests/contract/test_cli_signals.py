@@ -136,7 +136,12 @@ def _require_nothing_half_written(folder: Path) -> None:
     assert not [path for path in folder.rglob("*") if path.name.endswith(half)]
     out = folder / "out"
     files = {path.name for path in out.iterdir()} if out.exists() else set()
-    assert files in (set(), {"results.zarr"}, {"run.npz", "scene.json"}, {"mechanism.toml", "pair.urdf"})
+    assert files in (
+        set(),
+        {"results.zarr"},
+        {"run.npz", "scene.json"},
+        {"mechanism.toml", "pair.urdf", "default.scene.toml"},
+    )
     if "run.npz" in files:
         ckc_pin.Run.load(out)
 

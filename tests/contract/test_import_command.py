@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import ckc_pin
 from tests.contract.helpers.bad import Bad, expect
 from tests.contract.helpers.command import ckc
 
@@ -49,7 +50,9 @@ def test_json_has_files_notes_and_check(folder: Path) -> None:
     result = ckc("import", "linkage.xml", "--out", "there/deep", "--json").json
     assert set(result) == {"status", "format", "written", "warnings", "left_out", "guessed", "check"}
     assert result["format"] == "linkage.xml, a MuJoCo model"
-    assert result["written"] == ["there/deep/mechanism.toml", "there/deep/linkage.urdf"]
+    assert result["written"] == [
+        f"there/deep/{file}" for file in ("mechanism.toml", "linkage.urdf", "default.scene.toml")
+    ]
     assert result["left_out"] == []
     assert result["guessed"] == ["ranges are hard stops without rebound; in MuJoCo they are soft: a"]
     check = ckc("check", "there/deep", "--json").json
@@ -73,7 +76,8 @@ def test_existing_files_are_kept_without_overwrite(folder: Path) -> None:
     file.write_text("mine", encoding="utf-8")
     refused = ckc("import", "linkage.xml")
     assert refused.code == 2
-    assert "linkage/mechanism.toml and linkage/linkage.urdf: there already" in refused.err
+    files = ("mechanism.toml", "linkage.urdf", "default.scene.toml")
+    assert f"{' and '.join(f'linkage/{name}' for name in files)}: there already" in refused.err
     assert "--overwrite" in refused.err
     assert file.read_text(encoding="utf-8") == "mine"
     assert ckc("import", "linkage.xml", "--overwrite").code == 0
@@ -211,7 +215,7 @@ CASES = [
         files=mjcf("", FINE),
     ),
     # URDF
-    Bad("a xacro", R, ["a xacro file", "expand it first"], files=urdf('<link name="${x}"/>')),
+    Bad("an unknown property", R, ["xacro cannot expand it", "'x'"], files=urdf('<link name="${x}"/>')),
     Bad("two roots", R, ["roots found: 'base', 'lost'"], files=urdf('<link name="lost"/>')),
     Bad(
         "unknown loop",
@@ -286,6 +290,72 @@ def test_robot_yaml_needs_pyyaml(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     refused = ckc("import", "r.urdf")
     assert refused.code == 2
     assert "robot.yaml: reading it needs PyYAML" in refused.err
+
+
+# --- scenes and import in memory --------------------------------------------------------------------------------------
+
+KEYS = '<keyframe><key qpos="0.1 -0.2 0.1"/><key name="a/b" qpos="-0.3 0 0.2"/></keyframe></mujoco>'
+
+
+def test_imported_folder_can_be_run(folder: Path) -> None:
+    ckc("import", "linkage.xml")
+    outcome = ckc("run", "linkage", "--json").json
+    assert (outcome["status"], outcome["t"]) == ("done", 1.0)
+
+
+def test_key_frames_are_the_guess_and_scenes(folder: Path) -> None:
+    """The first key frame is where assembly starts, each other one is a scene that starts there."""
+    (folder / "keys.xml").write_text(FOUR_BAR.replace("</mujoco>", KEYS), encoding="utf-8")
+    written = ckc("import", "keys.xml", "--json").json["written"]
+    assert written[2:] == ["keys/default.scene.toml", "keys/a_b.scene.toml"]
+    content: dict[str, Any] = tomllib.loads((folder / "keys" / "mechanism.toml").read_text(encoding="utf-8"))
+    assert content["q_guess"] == {"a": 0.1, "b": -0.2, "c": 0.1}
+    scene: dict[str, Any] = tomllib.loads((folder / "keys" / "a_b.scene.toml").read_text(encoding="utf-8"))
+    assert scene["initial"]["q"] == {"a": -0.3, "b": 0.0, "c": 0.2}
+    assert ckc("run", "keys/a_b", "--json").json["status"] == "done"
+
+
+def test_key_frame_of_another_model_is_left_out(folder: Path) -> None:
+    keys = KEYS.replace("0.1 -0.2 0.1", "0.1 -0.2 0.1 7")
+    (folder / "keys.xml").write_text(FOUR_BAR.replace("</mujoco>", keys), encoding="utf-8")
+    result = ckc("import", "keys.xml", "--json").json
+    assert any("key frames are left out" in note for note in result["guessed"])
+    assert result["check"]["d"] == 1
+
+
+def test_foreign_file_is_used_without_import(folder: Path) -> None:
+    """The notes are on stderr, and the results are those of the imported mechanism. Nothing is written."""
+    ckc("import", "linkage.xml")
+    checked = ckc("check", "linkage.xml", "--json")
+    assert checked.json == ckc("check", "linkage", "--json").json
+    assert checked.err.startswith("note: linkage.xml is imported as linkage.xml, a MuJoCo model\n  guessed: ranges are")
+    run, same = (ckc("run", what, "--json").json for what in ("linkage.xml", "linkage"))
+    assert run["q_tree"] == same["q_tree"]
+    with pytest.warns(UserWarning, match="is imported as"):
+        mechanism = ckc_pin.load("linkage.xml")
+    assert mechanism.coordinates == ("a", "b", "c")
+    with pytest.warns(UserWarning, match="is imported as"):
+        finished = ckc_pin.simulate("linkage.xml", {"t_end": 0.1})
+    assert finished.status == "done"
+    with pytest.warns(UserWarning, match="is imported as"):
+        scene = ckc_pin.Scene(ckc_pin.load(folder / "linkage.xml"), t_end=0.1)
+    assert ckc_pin.simulate(scene).status == "done"
+    assert sorted(path.name for path in folder.iterdir()) == ["linkage", "linkage.xml"]
+    refused = ckc("check", "nowhere.xml")
+    assert (refused.code, "nowhere.xml" in refused.err) == (2, True)
+
+
+def test_repair_is_offered_and_done(folder: Path) -> None:
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="-0.5" ixy="0" ixz="0" iyz="0"/></inertial>'
+    for name, text in urdf("").items():
+        (folder / name).write_text(
+            text.replace('<link name="arm"/>', f'<link name="arm">{body}</link>'), encoding="utf-8"
+        )
+    refused = ckc("import", "r.urdf")
+    assert (refused.code, "--repair" in refused.err, (folder / "r").exists()) == (2, True, False)
+    repaired = ckc("import", "r.urdf", "--repair")
+    assert repaired.code == 0
+    assert "guessed: repaired: principal moments of link arm" in repaired.out
 
 
 # --- published robots ---------------------------------------------------------------------------------------------

@@ -266,6 +266,19 @@ def test_transmissions_and_command_interfaces_are_motors(tmp_path: Path) -> None
     assert draft.build_mechanism().independent[0] in ("j1", "j3")
 
 
+def test_ros2_control_declares_mimics_and_efforts_limit_motors(tmp_path: Path) -> None:
+    params = '<param name="mimic">j1</param><param name="multiplier">-3</param>'
+    control = f'<ros2_control><joint name="j3"><command_interface name="position"/>{params}</joint></ros2_control>'
+    limited = JOINTS.replace(
+        'name="j1" type="continuous">', 'name="j1" type="continuous"><limit effort="20" velocity="1"/>'
+    )
+    motor = transmission("Simple", '<joint name="j1"/>', end("actuator", "m", -50))
+    draft = imported(tmp_path, LINKS + limited + control + motor)
+    assert [(m.joint, m.ratio, m.torque_limit) for m, _ in draft.motors] == [("j1", -50.0, 0.4)]
+    assert '<mimic joint="j1" multiplier="-3.0" offset="0.0" />' in draft.urdf_text()
+    assert draft.build_mechanism().d == 2
+
+
 def test_motors_of_a_differential_turn_as_ros_control_says(tmp_path: Path) -> None:
     """The formulas of ros_control: n_1 (m_1 q_1 + m_2 q_2) and so on, with n = 7, 11 and m = 3, 5."""
     joints, actuators = (

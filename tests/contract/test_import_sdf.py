@@ -331,7 +331,7 @@ REFUSED = {
     "broken XML": ("<sdf><model", "malformed XML"),
     "no model": (sdf(""), "no <model>"),
     "no version": (sdf("", "new"), "expected a version"),
-    "a word": (model(link("a", "0 0 up 0 0 0")), "'0 0 up 0 0 0' is not 6 numbers"),
+    "a word": (model(link("a", "0 0 up 0 0 0")), "'0 0 up 0 0 0' is not 6 finite numbers"),
     "no quaternion": (
         model('<link name="a"><pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose></link>'), "no rotation",
     ),

@@ -32,51 +32,27 @@ CHECKED_ARRAYS = (
 
 @dataclass
 class Compiled:
-    """A compiled model, with names for bodies and joints that have none.
-
-    Attributes
-    ----------
-    mujoco : module
-    source : str
-        Name of the model in messages.
-    model : MjModel
-    bodies, joints : list of str
-        Names by MuJoCo's number.
-    unweighed : list of str
-        Shapes that should have mass and whose mesh is missing.
-    weightless : set of int
-        Bodies that have no other mass.
-    undrawn : int
-        Number of shapes that only MuJoCo can draw.
-    warnings : list of str
-        MuJoCo's warnings about the model.
-    """
+    """A compiled model, with names for bodies and joints that have none."""
 
     mujoco: Any
-    source: str
+    source: str  # name of the model in messages
     model: Any = None
-    bodies: list[str] = field(default_factory=list)
+    bodies: list[str] = field(default_factory=list)  # names by MuJoCo's number
     joints: list[str] = field(default_factory=list)
-    unweighed: list[str] = field(default_factory=list)
-    weightless: set[int] = field(default_factory=set)
-    undrawn: int = 0
-    warnings: list[str] = field(default_factory=list)
+    unweighed: list[str] = field(default_factory=list)  # shapes that should have mass and whose mesh is missing
+    weightless: set[int] = field(default_factory=set)  # bodies that have no other mass
+    undrawn: int = 0  # number of shapes that only MuJoCo can draw
+    warnings: list[str] = field(default_factory=list)  # MuJoCo's
 
     @classmethod
     def of(cls, document: Document) -> Compiled:
-        """Compile a document.
-
-        Raises
-        ------
-        InputError
-            MuJoCo is not installed, or does not accept the model.
-        """
+        """Compile a document."""
         compiled = cls(_import_mujoco(document.source), document.source)
         with compiled._collecting_warnings():
             spec = compiled._parse(document)
             spec.assets, missing = compiled._remove_unneeded_meshes(spec, document)
             try:
-                compiled.model = spec.compile()
+                compiled.model = compiled._compile(spec)
             except (ValueError, RuntimeError) as error:
                 raise _explain_error(document, error) from None
         compiled._check_numbers()
@@ -90,6 +66,18 @@ class Compiled:
         """Return the name of a site, tendon, actuator or other object by its number; empty if it has none."""
         name: str = getattr(self.model, kind)(int(number)).name
         return name
+
+    def _compile(self, spec: Any) -> Any:
+        """Compile a model, without its key frames if they do not fit to it."""
+        try:
+            return spec.compile()
+        except (ValueError, RuntimeError) as error:
+            if not spec.keys or "key" not in str(error):
+                raise
+            self.warnings.append(f"key frames are left out: {_join_lines(str(error))}")
+            for key in list(spec.keys):
+                spec.delete(key)
+            return spec.compile()
 
     def _parse(self, document: Document) -> Any:
         """Parse the XML. Attached models are parsed on their own first, so that a message names the right model."""

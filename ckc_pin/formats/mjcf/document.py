@@ -25,13 +25,11 @@ from ckc_pin.formats.repository import repository_of, resolve_links
 
 __all__ = ["MAX_MAGNITUDE", "Document"]
 
-ASSEMBLED_KEY = "assembled"  # name of the key frame that `ckc export` writes
 MAX_MAGNITUDE = 1e100  # of any number in a model; squares of larger numbers overflow
 MAX_BODIES, MAX_ELEMENTS = 1000, 20_000  # after <replicate> and <attach>; MuJoCo needs seconds to compile these
 MAX_MESH_PARAMETER = 1000  # a built-in mesh has as many vertices as its parameters say
 MAX_MESH_BYTES = 64 * 2**20
 
-KEY_FRAME_NOTE = "key frames; one of them may be a better [q_guess]"
 SECTION_NOTES = {  # sections that are removed with a note
     "contact": "contact pairs and exclusions, because contact is not supported",
     "deformable": "deformable bodies",
@@ -59,21 +57,11 @@ TEXT_ATTRIBUTES = {  # their text may look like a number
 
 @dataclass
 class _ModelFiles:
-    """Tokens for the files of a model and of the models that it attaches.
+    """Tokens for the files of a model and of the models that it attaches."""
 
-    Attributes
-    ----------
-    folder : Path
-        The model's repository. No file outside it is opened.
-    paths : dict of str to Path
-        Mesh file of each token. It need not exist.
-    models : int
-        Number of attached models so far.
-    """
-
-    folder: Path
-    paths: dict[str, Path] = field(default_factory=dict)
-    models: int = 0
+    folder: Path  # the model's repository; no file outside it is opened
+    paths: dict[str, Path] = field(default_factory=dict)  # mesh file of each token; it need not exist
+    models: int = 0  # number of attached models so far
 
     def add_mesh(self, path: Path) -> str:
         """Return a new token for a mesh file."""
@@ -87,26 +75,14 @@ class _ModelFiles:
         return f"model_{self.models}.xml"
 
     def resolve(self, folder: Path, file: str, where: str) -> Path:
-        """Return the path of a file, relative to a folder.
-
-        Raises
-        ------
-        InputError
-            The file is not in the model's repository.
-        """
+        """Return the path of a file, relative to a folder."""
         path = resolve_links(folder / file)
         if not file or path is None or not path.is_relative_to(self.folder):
             raise InputError(f"{where}: expected a file in the model's repository {self.folder.name!r}")
         return path
 
     def read_mesh(self, token: str) -> bytes | None:
-        """Return the content of a mesh file; None if it is not readable or not in the model's repository.
-
-        Raises
-        ------
-        InputError
-            The file is too large.
-        """
+        """Return the content of a mesh file; None if it is not readable or not in the model's repository."""
         path = resolve_links(self.paths[token])
         if path is None or not path.is_relative_to(self.folder):
             return None
@@ -124,13 +100,7 @@ class _ModelFiles:
 def _expand_includes(
     element: Element, folder: Path, files: _ModelFiles, seen: set[Path], source: str, depth: int = 0
 ) -> None:
-    """Replace each <include> by the content of its file. A file may be included once.
-
-    Raises
-    ------
-    InputError
-        A file is included twice, is not in the model's repository, or is not XML.
-    """
+    """Replace each <include> by the content of its file. A file may be included once."""
     if depth > MAX_XML_DEPTH:
         raise InputError(f"{source}: elements nested more than {MAX_XML_DEPTH} deep are not accepted")
     position = 0
@@ -153,38 +123,17 @@ def _expand_includes(
 
 @dataclass
 class Document:
-    """The prepared XML of a model, with its files and attached models.
+    """The prepared XML of a model, with its files and attached models."""
 
-    Attributes
-    ----------
-    source : str
-        Name of the model in messages.
-    root : Element
-        <mujoco>, without any <include>.
-    files : _ModelFiles
-        Files of the model and of all models that it attaches.
-    models : dict of str to Document
-        Attached models by token.
-    left_out : list of str
-        Notes on removed elements that would change the motion.
-    """
-
-    source: str
-    root: Element
-    files: _ModelFiles
-    models: dict[str, Document] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    source: str  # name of the model in messages
+    root: Element  # <mujoco>, without any <include>
+    files: _ModelFiles  # of the model and of all models that it attaches
+    models: dict[str, Document] = field(default_factory=dict)  # attached models by token
+    left_out: list[str] = field(default_factory=list)  # removed elements that would change the motion
 
     @classmethod
     def read(cls, text: str, path: Path) -> Document:
-        """Parse and prepare a model, with the files that it includes and attaches.
-
-        Raises
-        ------
-        InputError
-            The XML is malformed, a file is outside the model's repository or included twice, a number is not finite, or
-            there are too many bodies.
-        """
+        """Parse and prepare a model, with the files that it includes and attaches."""
         document = cls._read(text, path.absolute(), str(path), _ModelFiles(repository_of(path.absolute().parent)), ())
         bodies, elements = document._count()
         if bodies > MAX_BODIES or elements > MAX_ELEMENTS:
@@ -214,25 +163,23 @@ class Document:
             element.text = element.tail = None
             _check_numbers(element, source)
         document = cls(source, root, files)
-        document._remove_sections(keep_key=not attached_by)
+        document._remove_sections(keep_keys=not attached_by)
         document._remove_elements()
         document._replace_meshes(path.parent)
         document._read_attached_models(path.parent, (*attached_by, path.resolve()))
         indent(root)
         return document
 
-    def _remove_sections(self, keep_key: bool) -> None:
+    def _remove_sections(self, keep_keys: bool) -> None:
         """Remove sections without influence on a mechanism, and note those with influence on MuJoCo's motion."""
         for section in list(self.root):
             if section.tag in SECTION_NOTES and len(section):
                 self._add_note(SECTION_NOTES[section.tag])
             if section.tag in SECTION_NOTES or section.tag in IRRELEVANT_SECTIONS:
                 self.root.remove(section)
-        for keyframe in self.root.findall("keyframe"):
-            for key in keyframe.findall("key"):
-                if not keep_key or key.get("name") != ASSEMBLED_KEY:
-                    self._add_note(KEY_FRAME_NOTE)
-                    keyframe.remove(key)
+        for keyframe in self.root.findall("keyframe") if not keep_keys else ():
+            self._add_note("key frames of attached models")
+            self.root.remove(keyframe)
         for equality in self.root.findall("equality"):
             for element in [e for e in equality if e.tag not in SUPPORTED_EQUALITIES]:
                 self._add_note(f"equality <{element.tag}> {element.get('name', '')}".rstrip())

@@ -66,6 +66,7 @@ def read_mjcf(text: str, path: Path) -> Robot:
         actuated=actuators.joints or None,
         gravity=round_vector((0.0, 0.0, 0.0) if "gravity" in disabled else model.opt.gravity),
         q_guess=tree.q_guess,
+        key_frames=tree.key_frames,
         guessed=tree.guessed + [f"MuJoCo warns: {warning}" for warning in compiled.warnings],
         left_out=[
             *tree.left_out,

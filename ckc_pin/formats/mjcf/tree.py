@@ -8,8 +8,8 @@ MuJoCo's values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from ckc_pin.formats.urdf.elements import format_numbers, make_visual
 
 __all__ = ["MjcfTree", "Placed"]
 
+ASSEMBLED_KEY = "assembled"  # name of the key frame that `ckc export` writes
 JOINT_KINDS = ("free", "ball", "slide", "hinge")  # by mjtJoint
 SPHERE, CAPSULE, CYLINDER, BOX = 2, 3, 5, 6  # mjtGeom
 ORTHOGONAL_TOLERANCE = 1e-12  # between the axes of three slides
@@ -54,93 +55,63 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Joint:
-    """A compiled joint, in the frame of its body.
-
-    Attributes
-    ----------
-    number : int
-        MuJoCo's.
-    name : str
-    kind : str
-        hinge, slide, ball or free.
-    qpos_index : int
-        Where its values begin in qpos.
-    position, axis : (3,) arrays
-        A point of the axis (m), and the unit direction.
-    ref : float
-        Value in the reference pose, rad or m.
-    limits : JointLimits
-    has_stops : bool
-        Whether the range acts.
-    stiffness, rest, damping, friction, armature : float
-        Damping and armature include those of the actuators on the joint.
-    is_nonlinear : bool
-        Whether stiffness or damping have terms of higher order.
-    """
+    """A compiled joint, in the frame of its body."""
 
     number: int
     name: str
-    kind: str
-    qpos_index: int
-    position: Array
-    axis: Array
-    ref: float
-    limits: JointLimits
-    has_stops: bool
-    stiffness: float
-    rest: float
-    damping: float
-    friction: float
-    armature: float
-    is_nonlinear: bool
+    kind: str  # hinge, slide, ball or free
+    qpos_index: int  # where its values begin in qpos
+    position: Array  # a point of the axis, m
+    ref: float  # value in the reference pose, rad or m
+    axis: JointAxis  # damping and armature include those of the actuators on the joint
+    is_nonlinear: bool  # whether stiffness or damping have terms of higher order
 
     @classmethod
     def read(cls, compiled: Compiled, number: int) -> _Joint:
         """Read a joint of the compiled model."""
         model, kind = compiled.model, JOINT_KINDS[compiled.model.jnt_type[number]]
         dof, qpos = int(model.jnt_dofadr[number]), int(model.jnt_qposadr[number])
-        damping, armature = float(model.dof_damping[dof]), float(model.dof_armature[dof])
+        axis = JointAxis(
+            model.jnt_axis[number].copy(),
+            slides=kind == "slide",
+            limits=_read_limits(compiled, number),
+            damping=float(model.dof_damping[dof]),
+            friction=float(model.dof_frictionloss[dof]),
+            armature=float(model.dof_armature[dof]),
+            stiffness=float(model.jnt_stiffness[number]),
+            rest=float(model.qpos_spring[qpos]),
+            stops=bool(model.jnt_limited[number]),
+        )
         on_joint = (compiled.mujoco.mjtTrn.mjTRN_JOINT, compiled.mujoco.mjtTrn.mjTRN_JOINTINPARENT)
         for k in range(model.nactuator):
             if int(model.actuator_trntype[k]) in on_joint and model.actuator_trnid[k, 0] == number:
                 gear = float(model.actuator_gear[k, 0])
-                damping += gear**2 * float(model.actuator_damping[k])
-                armature += gear**2 * float(model.actuator_armature[k])
+                axis.damping += gear**2 * float(model.actuator_damping[k])
+                axis.armature += gear**2 * float(model.actuator_armature[k])
         return cls(
             number=number,
             name=compiled.joints[number],
             kind=kind,
             qpos_index=qpos,
             position=np.zeros(3) if kind == "free" else model.jnt_pos[number].copy(),
-            axis=model.jnt_axis[number].copy(),
             ref=float(model.qpos0[qpos]) if kind in ("hinge", "slide") else 0.0,
-            limits=_read_limits(compiled, number),
-            has_stops=bool(model.jnt_limited[number]),
-            stiffness=float(model.jnt_stiffness[number]),
-            rest=float(model.qpos_spring[qpos]),
-            damping=damping,
-            friction=float(model.dof_frictionloss[dof]),
-            armature=armature,
+            axis=axis,
             is_nonlinear=bool(model.jnt_stiffnesspoly[number].any() or model.dof_dampingpoly[dof].any()),
         )
 
     @property
     def nonzero_properties(self) -> list[str]:
         """MuJoCo's names of the properties that produce forces or inertia at the joint."""
-        values = {
-            "damping": self.damping,
-            "stiffness": self.stiffness,
-            "frictionloss": self.friction,
-            "armature": self.armature,
-            "range": self.has_stops,
-        }
+        axis = self.axis
+        values = {"damping": axis.damping, "stiffness": axis.stiffness, "frictionloss": axis.friction}
+        values |= {"armature": axis.armature, "range": axis.stops}
         return [key for key, value in values.items() if value]
 
     def displacement(self, value: float) -> pin.SE3:
         """Return the displacement by a value of the joint (rad or m), relative to zero."""
         if self.kind == "slide":
-            return pin.SE3(np.eye(3), value * self.axis)
-        return pin.SE3(from_axis_angle(self.axis, value) if value else np.eye(3), np.zeros(3))
+            return pin.SE3(np.eye(3), value * self.axis.direction)
+        return pin.SE3(from_axis_angle(self.axis.direction, value) if value else np.eye(3), np.zeros(3))
 
 
 def _is_free_root(joints: Sequence[_Joint]) -> bool:
@@ -153,7 +124,7 @@ def _is_free_root(joints: Sequence[_Joint]) -> bool:
         return False
     if any(set(joint.nonzero_properties) - {"range"} for joint in joints):
         return False
-    axes = np.array([joint.axis for joint in joints[:3]])
+    axes = np.array([joint.axis.direction for joint in joints[:3]])
     return bool(np.abs(axes @ axes.T - np.eye(3)).max() < ORTHOGONAL_TOLERANCE)
 
 
@@ -171,41 +142,28 @@ def _read_limits(compiled: Compiled, number: int) -> JointLimits:
 
 @dataclass
 class MjcfTree:
-    """The tree of a compiled model as a URDF.
-
-    Parameters
-    ----------
-    compiled : Compiled
-    used_joints : set of int
-        Joints to which an actuator, a tendon or an equality constraint refers.
-
-    Attributes
-    ----------
-    links : dict of str to Link
-    joints : dict of str to Joint
-    bodies : list of Placed
-        By MuJoCo's number.
-    ref : dict of int to float
-        By number, the joints of one freedom with their values in the reference pose, rad or m.
-    q_guess : dict of str to float
-        The reference pose, or the key frame that `ckc export` writes: coordinates that are not zero.
-    guessed, left_out : list of str
-    """
+    """The bodies and joints of a compiled model."""
 
     compiled: Compiled
-    used_joints: set[int]
+    used_joints: set[int]  # to which an actuator, a tendon or an equality constraint refers
     links: dict[str, Link] = field(default_factory=dict)
     joints: dict[str, Joint] = field(default_factory=dict)
-    bodies: list[Placed] = field(default_factory=list)
-    ref: dict[int, float] = field(default_factory=dict)
+    bodies: list[Placed] = field(default_factory=list)  # by MuJoCo's number
+    ref: dict[int, float] = field(default_factory=dict)  # joints of one freedom with their values in the reference pose
+    # The key frame "assembled" that `ckc export` writes, the first one, or the reference pose. Zeros are left out.
     q_guess: dict[str, float] = field(default_factory=dict)
+    key_frames: dict[str, dict[str, float]] = field(default_factory=dict)
     guessed: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         model = self.model = self.compiled.model
         self._link_names, self._joint_names = {"world", *self.compiled.bodies}, set(self.compiled.joints)
-        self._start = model.key_qpos[0] if model.nkey else model.qpos0
+        names = [self.compiled.name("key", k) or f"key_{k}" for k in range(model.nkey)]
+        order = sorted(range(model.nkey), key=lambda k: names[k] != ASSEMBLED_KEY)
+        self._starts = [model.key_qpos[k] for k in order] or [model.qpos0]
+        self._configs: list[dict[str, float]] = [self.q_guess, *({} for _ in order[1:])]
+        self.key_frames = {names[k]: config for k, config in zip(order[1:], self._configs[1:], strict=True)}
         self.links["world"] = Link()
         self.bodies.append(Placed("world", pin.SE3.Identity()))
         for body in range(1, model.nbody):
@@ -250,16 +208,25 @@ class MjcfTree:
         if [joint.kind for joint in joints] == ["free"]:
             if joints[0].nonzero_properties:
                 self.left_out.append(f"{', '.join(joints[0].nonzero_properties)} of free joint {joints[0].name}")
-            qpos = self._start[joints[0].qpos_index :]
-            pose = self._add_free(joints[0].name, name, pin.SE3(from_quaternion(qpos[3:7]), qpos[:3].copy()))
+            first = joints[0].qpos_index
+
+            def read_pose(qpos: Array) -> pin.SE3:
+                return pin.SE3(from_quaternion(qpos[first + 3 : first + 7]), qpos[first : first + 3].copy())
+
+            pose = self._add_free(joints[0].name, name, read_pose)
         elif on_world and _is_free_root(joints) and not self.used_joints & {joint.number for joint in joints}:
             self.guessed.append(f"the three slides and the ball of body {name} are one free joint, 'root'")
-            self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.has_stops]
-            qpos = self._start[joints[0].qpos_index :]
-            shift = sum(((x - j.ref) * j.axis for x, j in zip(qpos[:3], joints, strict=False)), np.zeros(3))
-            pose = self._add_free(
-                make_unique("root", self._joint_names), name, start.pose * pin.SE3(from_quaternion(qpos[3:7]), shift)
-            )
+            self.left_out += [f"range of joint {joint.name}, part of 'root'" for joint in joints if joint.axis.stops]
+            first = joints[0].qpos_index
+
+            def compose_pose(qpos: Array) -> pin.SE3:
+                shift = sum(
+                    ((x - j.ref) * j.axis.direction for x, j in zip(qpos[first:], joints[:3], strict=False)),
+                    np.zeros(3),
+                )
+                return start.pose * pin.SE3(from_quaternion(qpos[first + 3 : first + 7]), shift)
+
+            pose = self._add_free(make_unique("root", self._joint_names), name, compose_pose)
         else:
             pose = self._add_chain(joints, name, start)
         self.bodies.append(Placed(name, pose))
@@ -275,12 +242,16 @@ class MjcfTree:
 
     # --- joints ------------------------------------------------------------------------------------
 
-    def _add_free(self, name: str, body: str, start: pin.SE3) -> pin.SE3:
+    def _add_free(self, name: str, body: str, read_pose: Callable[[Array], pin.SE3]) -> pin.SE3:
         """Add a floating joint, whose coordinates are the body's world pose; return the body's pose in its link."""
         self._joint_names.add(name)
         self._add_joint(name, "floating", "world", body, pin.SE3.Identity())
-        values = (*start.translation, *pin.log3(start.rotation))
-        self._set_guess((f"{name}.{label}" for label in FREE_LABELS), values)
+
+        def read(qpos: Array) -> Iterable[Any]:
+            pose = read_pose(qpos)
+            return (*pose.translation, *pin.log3(pose.rotation))
+
+        self._set_guess([f"{name}.{label}" for label in FREE_LABELS], read)
         return pin.SE3.Identity()
 
     def _add_chain(self, joints: Sequence[_Joint], body: str, start: Placed) -> pin.SE3:
@@ -302,22 +273,12 @@ class MjcfTree:
 
     def _add_hinge_or_slide(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
         """Add a joint of one freedom with its range, damping, friction and spring."""
-        axis = JointAxis(
-            np.array(round_vector(joint.axis)),
-            slides=joint.kind == "slide",
-            limits=joint.limits,
-            damping=joint.damping,
-            friction=joint.friction,
-            armature=joint.armature,
-            stiffness=joint.stiffness,
-            rest=joint.rest,
-            stops=joint.has_stops,
-        )
+        axis = replace(joint.axis, direction=np.array(round_vector(joint.axis.direction)))
         self._add_joint(joint.name, "prismatic" if axis.slides else "revolute", link, child, origin, [axis])
         if joint.is_nonlinear:
             self.left_out.append(f"quadratic and cubic parts of stiffness or damping of joint {joint.name}")
         self.ref[joint.number] = round_number(joint.ref)
-        self._set_guess([joint.name], [self._start[joint.qpos_index]])
+        self._set_guess([joint.name], lambda qpos: [qpos[joint.qpos_index]])
 
     def _add_ball(self, joint: _Joint, link: str, child: str, origin: pin.SE3) -> None:
         """Add three hinges in series for a ball joint."""
@@ -325,15 +286,21 @@ class MjcfTree:
         self._joint_names.update(names)
         suffixes = [name.removeprefix(joint.name) for name in names]
         self._add_joint(joint.name, "ball", link, child, origin, ball_axes(suffixes))
-        rotation = from_quaternion(self._start[joint.qpos_index : joint.qpos_index + 4])
-        # The hinges turn about x, y and z in this order, so their angles are those of the inverse with opposite sign.
-        self._set_guess(names, [-angle for angle in to_rpy(rotation.T)])
+
+        def read(qpos: Array) -> Iterable[Any]:
+            # The hinges turn about x, y and z in this order: their angles are the inverse's with opposite sign.
+            rotation = from_quaternion(qpos[joint.qpos_index : joint.qpos_index + 4])
+            return [-angle for angle in to_rpy(rotation.T)]
+
+        self._set_guess(names, read)
         if joint.nonzero_properties:
             self.left_out.append(f"{', '.join(joint.nonzero_properties)} of ball joint {joint.name}")
 
-    def _set_guess(self, labels: Iterable[str], values: Iterable[Any]) -> None:
-        rounded = {label: round_number(float(x)) for label, x in zip(labels, values, strict=True)}
-        self.q_guess |= {label: x for label, x in rounded.items() if x != 0}
+    def _set_guess(self, labels: Sequence[str], read: Callable[[Array], Iterable[Any]]) -> None:
+        """Read coordinates from the values of qpos of each start."""
+        for config, qpos in zip(self._configs, self._starts, strict=True):
+            rounded = {label: round_number(float(x)) for label, x in zip(labels, read(qpos), strict=True)}
+            config |= {label: x for label, x in rounded.items() if x != 0 or config is not self.q_guess}
 
     def _add_joint(
         self, name: str, kind: JointKind, parent: str, child: str, origin: pin.SE3, axes: Sequence[JointAxis] = ()

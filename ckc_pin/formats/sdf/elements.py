@@ -17,6 +17,7 @@ from ckc_pin.formats.urdf.elements import make_visual
 
 __all__ = ["JOINT_KINDS", "parse_pose", "read_axes", "read_link", "read_number", "read_numbers", "read_pitch"]
 
+UNBOUNDED = ("lower", "upper", "effort", "velocity")  # may be infinite
 NO_LIMIT = 1e16  # SDFormat's value for an unlimited joint
 DEFAULT_MASS, DEFAULT_INERTIA = 1.0, 1.0  # kg and kg m^2 of a link that does not give them
 PERPENDICULAR_TOLERANCE = 1e-9
@@ -31,21 +32,15 @@ JOINT_KINDS: dict[str, JointKind] = {
 
 
 def read_numbers(element: Element | None, tag: str, default: str, count: int, where: str) -> list[float]:
-    """Return the numbers of a child element; `tag` may be a path, and empty for the element itself.
-
-    Raises
-    ------
-    InputError
-        There are not `count` finite numbers.
-    """
+    """Return the numbers of a child element; `tag` may be a path, and empty for the element itself."""
     child = element if element is None or not tag else element.find(tag)
     text = default if child is None or not (child.text or "").strip() else (child.text or "")
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or any(map(math.isnan, values)):
-        what = "a number" if count == 1 else f"{count} numbers"
+    if len(values) != count or not all(math.isfinite(x) or (tag in UNBOUNDED and x == x) for x in values):
+        what = "a finite number" if count == 1 else f"{count} finite numbers"
         raise InputError(
             f"{where}: <{tag or (element.tag if element is not None else '')}> {text.strip()!r} is not {what}"
         )
@@ -64,8 +59,6 @@ def parse_pose(element: Element | None, where: str) -> pin.SE3:
     has_quaternion = element.get("rotation_format") == "quat_xyzw"
     default = "0 0 0 0 0 0 1" if has_quaternion else "0 0 0 0 0 0"
     values = read_numbers(element, "", default, 7 if has_quaternion else 6, where)
-    if not all(map(math.isfinite, values)):
-        raise InputError(f"{where}: <pose> {element.text!r} has numbers that are not finite")
     if has_quaternion:
         rotation = from_quaternion([values[6], *require_quaternion(values[3:], where)[:3]])
     else:
@@ -138,11 +131,6 @@ def read_axes(element: Element, kind: str, rotate: Callable[[Element, Array], Ar
     rotate : callable
         Gets an <axis> and its direction as it is written, and returns the direction in the joint's frame.
     where : str
-
-    Raises
-    ------
-    InputError
-        An axis is missing or zero, or a number is malformed.
     """
     if kind in ("fixed", "ball"):
         return [] if kind == "fixed" else ball_axes()

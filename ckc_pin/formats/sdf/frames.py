@@ -21,26 +21,13 @@ MODEL_FRAME = "__model__"
 
 @dataclass
 class _Frame:
-    """A frame by its pose relative to another frame.
+    """A frame by its pose relative to another frame. Names are full ones."""
 
-    Attributes
-    ----------
-    where : str
-        Its element in messages.
-    relative_to : str
-        Full name.
-    pose : SE3
-    attached_to : str
-        Frame of the same rigid body: empty for a link.
-    placed : str
-        For a model: its frame that `pose` places, if it is not the model's own.
-    """
-
-    where: str
+    where: str  # its element in messages
     relative_to: str
     pose: pin.SE3
-    attached_to: str = ""
-    placed: str = ""
+    attached_to: str = ""  # a frame of the same rigid body; empty for a link
+    placed: str = ""  # for a model: its frame that `pose` places, if it is not the model's own
 
 
 @dataclass
@@ -53,25 +40,13 @@ class FrameGraph:
     def add(
         self, name: str, where: str, relative_to: str, pose: pin.SE3, attached_to: str = "", placed: str = ""
     ) -> None:
-        """Add a frame.
-
-        Raises
-        ------
-        InputError
-            A frame of this name exists.
-        """
+        """Add a frame. Its name must be new."""
         if name in self.frames or name == WORLD:
             raise InputError(f"{where}: two frames are called {name!r}")
         self.frames[name] = _Frame(where, relative_to, pose, attached_to, placed)
 
     def find(self, name: str, scope: str, where: str) -> str:
-        """Return the full name of a frame that an element inside a model refers to.
-
-        Raises
-        ------
-        InputError
-            There is no such frame.
-        """
+        """Return the full name of a frame that an element inside a model refers to. It must exist."""
         if name == WORLD:
             return WORLD
         full = join(scope, name)
@@ -82,13 +57,7 @@ class FrameGraph:
         raise InputError(f"{where}: there is no frame {name!r}; there are {list_names(inside) or 'none'}")
 
     def pose(self, name: str) -> pin.SE3:
-        """Return the pose of a frame in the world.
-
-        Raises
-        ------
-        InputError
-            Frames are placed relative to each other in a cycle.
-        """
+        """Return the pose of a frame in the world. Poses must not form a cycle."""
         if name == WORLD:
             return pin.SE3.Identity()
         if name not in self._poses:
@@ -115,13 +84,7 @@ class FrameGraph:
         return pose
 
     def link_of(self, name: str, where: str) -> str:
-        """Return the link to which a frame is attached, or "world".
-
-        Raises
-        ------
-        InputError
-            The frame is attached to itself, or to no link.
-        """
+        """Return the link to which a frame is attached, or "world"."""
         visited = set()
         while name != WORLD and self.frames[name].attached_to:
             if name in visited:

@@ -28,46 +28,23 @@ from ckc_pin.mechanism.spec import CouplingSpec
 __all__ = ["read_sdf"]
 
 FULL = "="  # before a name that is complete already
+TRUE = ("true", "1")
+LATEST = "1.12"  # version of a file that gives none
 MAX_DEPTH = 20  # nested and included models
 READ = {  # other elements are left out with a note
-    "sdf": {"model", "world", "include"},
-    "world": {"model", "include", "gravity", "joint", "frame"},
-    "model": {"link", "joint", "frame", "model", "include", "pose", "static", "drake:ball_constraint", "plugin"},
-    "link": {"pose", "inertial", "visual"},
-    "joint": {
-        *("parent", "child", "pose", "axis", "axis2", "screw_thread_pitch", "thread_pitch"),
-        *("gearbox_ratio", "gearbox_reference_body"),
-    },
+    "sdf": "world",
+    "world": "model include gravity joint frame",
+    "include": "uri name pose static placement_frame",
+    "model": "link joint frame model include pose static drake:ball_constraint plugin",
+    "link": "pose inertial visual",
+    "joint": "parent child pose axis axis2 screw_thread_pitch thread_pitch gearbox_ratio gearbox_reference_body",
 }
-IRRELEVANT = {
-    "self_collide",
-    "light",
-    "scene",
-    "physics",
-    "gui",
-    "allow_auto_disable",
-    "enable_wind",
-    "state",
-    "spherical_coordinates",
-}
+IRRELEVANT = "self_collide light scene physics gui allow_auto_disable enable_wind state spherical_coordinates"
 MOTOR_PLUGINS = ("JointController", "JointPositionController", "ApplyJointForce")
 
 
 def read_sdf(text: str, path: Path) -> Robot:
-    """Read an SDFormat file.
-
-    Parameters
-    ----------
-    text : str
-    path : Path
-        File of the text. Included models are searched for in its repository.
-
-    Raises
-    ------
-    InputError, MechanismError
-        The text is not valid SDFormat: a number is malformed, a frame or file does not exist, poses form a cycle, or an
-        element names a link that does not exist.
-    """
+    """Read an SDFormat file."""
     return _Reader(path).read(parse_xml(text, str(path)))
 
 
@@ -96,46 +73,40 @@ class _Reader:
     prefix: str = ""
 
     def read(self, root: Element) -> Robot:
-        version = _version(root, self.path)
+        version = _parse_version(root.get("version", LATEST), str(self.path))
         world = root.find("world")
-        top = root if world is None else world
-        self._count_unread(root)
-        if world is not None:
-            self._count_unread(world)
-        models = [(element, self.path) for element in top.findall("model")]
-        included = [self._open_include(element, self.path) for element in top.findall("include")]
-        if not models and not included:
+        if world is None:
+            world = Element("world")
+            world.extend(root)
+        else:
+            self._count_unread(root)
+        self._count_unread(world)
+        models = [(element, self.path) for element in world.findall("model")]
+        models += [self._open_include(element, self.path) for element in world.findall("include")]
+        if not models:
             raise InputError(f"{self.path}: no <model>")
-        if len(models) + len(included) == 1 and not (world is not None and world.find("joint") is not None):
-            self.prefix = f"{(models or included)[0][0].get('name', 'model')}::"
-        for element, path in (*models, *included):
+        declared = models[0][0].get("name", "")
+        if len(models) == 1 and world.find("joint") is None:
+            self.prefix = f"{declared}::"
+        for element, path in models:
             self._add_model(element, "", version, path, ())
-        for element in () if world is None else world.findall("frame"):
+        for element in world.findall("frame"):
             self._add_frame(element, "")
-        if world is not None:
-            self.pending += [_Pending(element, "", version) for element in world.findall("joint")]
-        declared = (models or included)[0][0].get("name", "")
-        robot = Robot(
-            name=choose_name(self.path, declared), origin=f"{self.path.name}, an SDFormat file", source=str(self.path)
-        )
+        self.pending += [_Pending(element, "", version) for element in world.findall("joint")]
+        name, origin = choose_name(self.path, declared), f"{self.path.name}, an SDFormat file"
+        robot = Robot(name=name, origin=origin, source=str(self.path))
         robot.links = {WORLD: Link(), **{self._short(name): link for name, link in self.links.items()}}
         self._place_frames()
         self._add_joints(robot)
         self._add_roots(robot)
-        gravity = (
-            read_numbers(world, "gravity", "0 0 -9.8", 3, f"{self.path}: <world>")
-            if world is not None
-            else [0, 0, -9.81]
-        )
-        robot.gravity = round_vector(gravity)
-        if world is None or world.find("gravity") is None:
+        default = "0 0 -9.8" if root.find("world") is not None else "0 0 -9.81"
+        robot.gravity = round_vector(read_numbers(world, "gravity", default, 3, f"{self.path}: <world>"))
+        if world.find("gravity") is None:
             robot.guessed.append(f"gravity is {robot.gravity[2]:g} m/s² along z, because the file does not give it")
         robot.guessed += [f"{what}: {list_names(names)}" for what, names in self.notes.items()]
         robot.leave_out(self.unread)
-        names = robot.axes
-        robot.actuated = [
-            name for name in dict.fromkeys(self._short(join(*item)) for item in self.actuated) if name in names
-        ] or None
+        actuated = dict.fromkeys(self._short(join(*item)) for item in self.actuated)
+        robot.actuated = [name for name in actuated if name in robot.axes] or None
         return robot
 
     def _short(self, name: str) -> str:
@@ -143,19 +114,14 @@ class _Reader:
         return name.removeprefix(self.prefix)
 
     def _count_unread(self, element: Element) -> None:
-        names = READ[element.tag] | IRRELEVANT
-        self.unread.update(f"<{child.tag}> of <{element.tag}>" for child in element if child.tag not in names)
+        tags = f"{READ[element.tag]} {IRRELEVANT}".split()
+        self.unread.update(f"<{child.tag}> of <{element.tag}>" for child in element if child.tag not in tags)
 
     # --- models ------------------------------------------------------------------------------------
 
     def _open_include(self, element: Element, path: Path, opened: tuple[Path, ...] = ()) -> tuple[Element, Path]:
-        """Return the model of an <include>, renamed and placed as the element says, and its file.
-
-        Raises
-        ------
-        InputError
-            The file does not exist in the repository, has no model, or includes itself.
-        """
+        """Return the model of an <include>, renamed and placed as the element says, and its file."""
+        self._count_unread(element)
         uri = (element.findtext("uri") or "").strip()
         where = f"{path}: <include> {uri!r}"
         file = find_in_repository(uri, path, where, "model.sdf")
@@ -167,9 +133,9 @@ class _Reader:
         model = root.find("model")
         if model is None:
             raise InputError(f"{where}: {file.name} has no <model>")
-        model.set("version", ".".join(map(str, _version(root, file))))
+        model.set("version", root.get("version", LATEST))
         model.set("name", str(element.findtext("name") or model.get("name", "model")))
-        if element.get("merge", "false").lower() in ("true", "1"):
+        if element.get("merge", "false").lower() in TRUE:
             raise InputError(
                 f"{where}: merge is not supported; remove it and write {model.get('name')}::NAME for names inside"
             )
@@ -216,7 +182,7 @@ class _Reader:
         inner_links = [self.canonical[join(name, inner.attrib["name"])] for inner, _, _ in nested]
         self.canonical[name] = next(iter([join(name, canonical)] if canonical else links or inner_links), "")
         self.frames.frames[model_frame].attached_to = f"{FULL}{self.canonical[name]}" if self.canonical[name] else ""
-        if (element.findtext("static") or "").strip().lower() in ("true", "1"):
+        if (element.findtext("static") or "").strip().lower() in TRUE:
             self.static += [link for link in self.links if link.startswith(f"{name}::")]
         for joint in element.findall("joint"):
             child = (joint.findtext("child") or "").strip()
@@ -323,7 +289,7 @@ class _Reader:
         """Return the world's rotation of the frame in which an axis is written."""
         xyz = axis.find("xyz")
         expressed_in = "" if xyz is None else xyz.get("expressed_in", "")
-        uses_model = (axis.findtext("use_parent_model_frame") or "").strip().lower() in ("true", "1")
+        uses_model = (axis.findtext("use_parent_model_frame") or "").strip().lower() in TRUE
         if expressed_in:
             frame = self.frames.find(expressed_in, scope, f"{where}, <xyz>")
         else:
@@ -332,19 +298,18 @@ class _Reader:
 
     def _resolve_mimics(self, robot: Robot) -> None:
         """Give mimics the names of the robot's coordinates; leave out those of joints that do not exist."""
-        names = robot.axes
+        axes = robot.axes
         for joint in robot.joints.values():
             scope = joint.name.rpartition("::")[0]
-            for axis in joint.axes:
-                if axis.mimic is None:
-                    continue
-                name = next((n for n in (join(scope, axis.mimic[0]), axis.mimic[0]) if n in names), None)
-                if name is None or name == joint.name:
+            for axis in (axis for axis in joint.axes if axis.mimic is not None):
+                master, *line = axis.mimic or ("", 1.0, 0.0)
+                name = next((n for n in (join(scope, master), master) if n in axes and n != joint.name), None)
+                axis.mimic = (name, line[0], line[1]) if name else None
+                if name is None:
                     robot.warnings.append(
-                        f"mimic of joint {joint.name} is left out, because {axis.mimic[0]!r} is not another joint; "
-                        "there is 1 freedom more"
+                        f"mimic of joint {joint.name} is left out, because {master!r} is not another joint; there is 1 "
+                        "freedom more"
                     )
-                axis.mimic = (name, *axis.mimic[1:]) if name and name != joint.name else None
 
     def _add_ball_constraint(self, robot: Robot, element: Element, scope: str) -> None:
         where = f"{self.path}: <drake:ball_constraint>"
@@ -371,10 +336,9 @@ class _Reader:
             direction = np.array(read_numbers(axis, "xyz", "0 0 1", 3, f"{where}, <{tag}>"))
             # Axes are written in the joint's frame, which is the child's unless a pose says otherwise.
             full_name = join(scope, element.get("name", ""))
-            world = (
-                direction if axis is None else self._axes_of(axis, scope, full_name, pending.version, where) @ direction
-            )
-            turns.append(self._turn(robot, self._short(base), self._short(self.frames.link_of(end, where)), world))
+            if axis is not None:
+                direction = self._axes_of(axis, scope, full_name, pending.version, where) @ direction
+            turns.append(self._turn(robot, self._short(base), self._short(self.frames.link_of(end, where)), direction))
         if None in turns:
             robot.warnings.append(
                 f"gearbox {element.get('name')} is left out, because no hinges connect its links with {reference}; "
@@ -399,11 +363,11 @@ class _Reader:
         for link in dict.fromkeys(self._short(name) for name in self.static):
             self._add_root(robot, link, "fixed")
         heads = [self._short(name) for name in self.canonical.values() if name] + list(robot.links)
-        reached = _connected(robot)
+        reached = robot.distances(WORLD)
         for link in heads:
             if link not in reached:
                 self._add_root(robot, link, "floating")
-                reached = _connected(robot)
+                reached = robot.distances(WORLD)
 
     def _add_root(self, robot: Robot, link: str, kind: str) -> None:
         full = next(name for name in self.links if self._short(name) == link)
@@ -422,29 +386,9 @@ class _Reader:
         )
 
 
-def _version(root: Element, path: Path) -> tuple[int, ...]:
-    """Return the version of the format, such as (1, 9)."""
-    if root.tag != "sdf":
-        raise InputError(f"{path}: the root element is <{root.tag}>; expected <sdf>")
-    return _parse_version(root.get("version", "1.12"), str(path))
-
-
 def _parse_version(text: str, where: str) -> tuple[int, ...]:
+    """Return the version of the format, such as (1, 9)."""
     try:
         return tuple(int(word) for word in text.split("."))
     except ValueError:
         raise InputError(f"{where}: <sdf version={text!r}>: expected a version, such as 1.9") from None
-
-
-def _connected(robot: Robot) -> set[str]:
-    """Return the links that joints connect with the world."""
-    neighbours: dict[str, list[str]] = {name: [] for name in robot.links}
-    for joint in robot.joints.values():
-        neighbours[joint.parent].append(joint.child)
-        neighbours[joint.child].append(joint.parent)
-    reached, pending = {WORLD}, [WORLD]
-    for link in pending:
-        new = [other for other in neighbours[link] if other not in reached]
-        reached.update(new)
-        pending += new
-    return reached

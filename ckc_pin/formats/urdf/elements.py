@@ -35,26 +35,14 @@ INERTIA_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "
 
 
 def parse_origin(element: Element, where: str) -> pin.SE3:
-    """Return the pose of an element's <origin>, the identity if there is none.
-
-    Raises
-    ------
-    InputError
-        xyz or rpy is not three finite numbers.
-    """
+    """Return the pose of an element's <origin>, the identity if there is none."""
     origin = element.find("origin")
     xyz, rpy = (parse_vector(origin, key, "0 0 0", f"{where}, <origin>") for key in ("xyz", "rpy"))
     return from_pose(xyz, rpy)
 
 
 def parse_vector(element: Element | None, attribute: str, default: str, where: str) -> list[float]:
-    """Return the three numbers of an attribute.
-
-    Raises
-    ------
-    InputError
-        The attribute is not three finite numbers.
-    """
+    """Return the three numbers of an attribute."""
     text = default if element is None else element.get(attribute, default)
     try:
         values = [float(word) for word in text.split()]

@@ -34,15 +34,7 @@ class _Content(msgspec.Struct, frozen=True):
 
 
 def add_loop_closures_yaml(robot: Robot, text: str, source: str) -> None:
-    """Add the hinges of a loop_closures.yaml. Its independent joints are the motors.
-
-    Raises
-    ------
-    InputError
-        Malformed YAML, a value of the wrong type, or a zero axis.
-    MechanismError
-        A link does not exist.
-    """
+    """Add the hinges of a loop_closures.yaml. Its independent joints are the motors."""
     content, unknown_keys = parse_yaml(text, _Content, source)
     robot.left_out += [f"{source}: unsupported key {key!r}" for key in unknown_keys if "loops" not in key]
     robot.warnings += [

@@ -1,13 +1,4 @@
-"""Loops and couplings in a URDF, which only their own programs read.
-
-| element | program |
-|---|---|
-| <loop>, <coupling> | generalized_rbda |
-| <loop_joint> with <link1>, <link2> | Drake before 2017, Isaac Sim |
-| <constraint> with <parent_origin>, <child_origin> | urdfdom, pull request 264 |
-| <drake:ball_constraint> | Drake |
-| <joint> and the plugin DetachableJoint in <gazebo> | Gazebo |
-"""
+"""Loops and couplings in a URDF, in elements that only their own programs read (`LOOP_TAGS`, <gazebo>)."""
 
 from __future__ import annotations
 
@@ -29,78 +20,74 @@ from ckc_pin.mechanism.spec import CouplingSpec
 
 __all__ = ["LOOP_TAGS", "add_gazebo", "add_loops"]
 
-LOOP_TAGS = ("loop", "loop_joint", "constraint", "drake:ball_constraint")
+LOOP_TAGS = {  # where they come from
+    "loop": "<loop> as in generalized_rbda",
+    "loop_joint": "<loop_joint> as in Drake's old format",
+    "constraint": "<constraint> as in urdfdom's proposal",
+    "drake:ball_constraint": "<drake:ball_constraint>",
+}
 KINDS: dict[str, JointKind] = {
     **{"revolute": "revolute", "continuous": "revolute", "hinge": "revolute", "prismatic": "prismatic"},
     **{"spherical": "ball", "ball": "ball", "fixed": "fixed", "weld": "fixed"},
     **{"universal": "universal", "cylindrical": "cylindrical"},
 }
-ENDS = {  # elements of both ends, by tag: the link's element, its attribute, and the element of the pose
+ENDS = {  # by tag: the element that names the link, its attribute, and the element of the pose
     "loop": (("predecessor", "link", "predecessor/origin"), ("successor", "link", "successor/origin")),
     "constraint": (("parent", "link", "parent_origin"), ("child", "link", "child_origin")),
+    "drake:ball_constraint": tuple(
+        (f"drake:ball_constraint_{body}", "name", f"drake:ball_constraint_{point}")
+        for body, point in (("body_A", "p_AP"), ("body_B", "p_BQ"))
+    ),
 }
 OPPOSITE = 1e-12  # 1 + cosine of two axes that point against each other
 
 
 def add_loops(robot: Robot, root: Element) -> Iterator[str]:
-    """Add the loops and couplings of a URDF, and yield what they are called.
-
-    Raises
-    ------
-    InputError, MechanismError
-        A type is unknown, a link does not exist, a number is malformed, or a loop connects a link with itself.
-    """
-    for tag, where_from in (("loop", "in generalized_rbda"), ("loop_joint", "in Drake's old format"),
-                            ("constraint", "in urdfdom's proposal")):  # fmt: skip
+    """Add the loops and couplings of a URDF, and yield what they are called."""
+    for tag, title in LOOP_TAGS.items():
         elements = root.findall(tag)
         for element in elements:
             robot.add_joint(_read_loop(element, robot))
         if elements:
-            yield f"<{tag}> as {where_from}"
+            yield title
     for element in root.findall("coupling"):
         _add_coupling(element, robot, f"{robot.source}: coupling {element.get('name', '')!r}")
     if root.find("coupling") is not None:
         yield "<coupling> as in generalized_rbda"
-    for element in root.findall("drake:ball_constraint"):
-        _add_ball_constraint(element, robot)
-    if root.find("drake:ball_constraint") is not None:
-        yield "<drake:ball_constraint>"
 
 
 def _read_loop(element: Element, robot: Robot) -> Joint:
-    where, kind = f"{robot.source}: {element.tag} {element.get('name', '')!r}", element.get("type", "")
-    links: list[str] = []
-    poses: list[pin.SE3] = []
+    where = f"{robot.source}: {element.tag} {element.get('name', '')!r}"
+    kind = "ball" if element.tag == "drake:ball_constraint" else element.get("type", "")
     if kind not in KINDS:
         raise MechanismError(f"{where}: unsupported type {kind!r}; expected one of {', '.join(KINDS)}")
-    for end, (link, pose) in zip(("first", "second"), _ends(element, where), strict=True):
-        _require_link(link, end if element.tag == "loop_joint" else ENDS[element.tag][len(links)][0], robot, where)
-        links.append(link)
-        poses.append(pose)
-    name = make_unique(element.get("name") or "loop", robot.joints)
-    if links[0] == links[1]:
-        raise MechanismError(f"{where}: it connects link {links[0]!r} with itself; expected two links")
+    ends = list(_ends(element, where))
+    for end, link, _ in ends:
+        _require_link(link, end, robot, where)
+    (_, one, _), (_, other, pose) = ends
+    if one == other:
+        raise MechanismError(f"{where}: it connects link {one!r} with itself; expected two links")
     axes = _read_axes(element, KINDS[kind], where)
     if element.tag == "constraint" and KINDS[kind] in ("revolute", "prismatic", "cylindrical"):
-        other = _direction(element, "child_axis", where)
-        poses[1] = poses[1] * pin.SE3(_rotate_onto(axes[0].direction, other), np.zeros(3))
-    return replace(Joint.between(name, KINDS[kind], links, poses, axes), closes=True)
+        child_axis = _direction(element, "child_axis", where)
+        pose = pose * pin.SE3(_rotate_onto(axes[0].direction, child_axis), np.zeros(3))
+    name = make_unique(element.get("name") or f"{one}_{other}", robot.joints)
+    return Joint(name, KINDS[kind], one, other, ends[0][2], pose, axes, closes=True)
 
 
-def _ends(element: Element, where: str) -> Iterator[tuple[str, pin.SE3]]:
-    """Yield link and pose of both ends."""
+def _ends(element: Element, where: str) -> Iterator[tuple[str, str, pin.SE3]]:
+    """Yield name, link and pose of both ends."""
     if element.tag == "loop_joint":
-        ends = [child for child in element if child.tag in ("link1", "link2")]  # some writers call both of them link1
-        if len(ends) != 2:
+        places = [child for child in element if child.tag in ("link1", "link2")]  # some writers call both link1
+        if len(places) != 2:
             raise InputError(f"{where}: expected <link1> and <link2>")
-        for end in ends:
-            xyz, rpy = (parse_vector(end, key, "0 0 0", f"{where}, <{end.tag}>") for key in ("xyz", "rpy"))
-            yield end.get("link", ""), from_pose(xyz, rpy)
-        return
-    for tag, attribute, origin in ENDS[element.tag]:
-        link, pose = element.find(tag), element.find(origin)
-        xyz, rpy = (parse_vector(pose, key, "0 0 0", f"{where}, <{origin}>") for key in ("xyz", "rpy"))
-        yield "" if link is None else link.get(attribute, ""), from_pose(xyz, rpy)
+        named: list[tuple[str, Element | None, str, Element | None]] = [(e.tag, e, "link", e) for e in places]
+    else:
+        named = [(tag, element.find(tag), key, element.find(pose)) for tag, key, pose in ENDS[element.tag]]
+    for tag, link, key, pose in named:
+        position = "value" if element.tag == "drake:ball_constraint" else "xyz"
+        xyz, rpy = (parse_vector(pose, name, "0 0 0", f"{where}, <{tag}>") for name in (position, "rpy"))
+        yield tag.removeprefix("drake:ball_constraint_"), "" if link is None else link.get(key, ""), from_pose(xyz, rpy)
 
 
 def _require_link(link: str, end: str, robot: Robot, where: str) -> None:
@@ -134,18 +121,6 @@ def _rotate_onto(one: Array, other: Array) -> Array:
         normal = np.cross(one, np.eye(3)[np.argmin(np.abs(one))])
         return np.array(pin.AngleAxis(np.pi, normal / np.linalg.norm(normal)).matrix())
     return np.array(pin.Quaternion.FromTwoVectors(one, other).matrix())
-
-
-def _add_ball_constraint(element: Element, robot: Robot) -> None:
-    where, links, poses = f"{robot.source}: <drake:ball_constraint>", [], []
-    for body, point in (("body_A", "p_AP"), ("body_B", "p_BQ")):
-        link = element.find(f"drake:ball_constraint_{body}")
-        links.append("" if link is None else link.get("name", ""))
-        _require_link(links[-1], body, robot, where)
-        xyz = parse_vector(element.find(f"drake:ball_constraint_{point}"), "value", "0 0 0", where)
-        poses.append(from_pose(xyz, (0.0, 0.0, 0.0)))
-    name = make_unique("_".join(links), robot.joints)
-    robot.add_joint(replace(Joint.between(name, "ball", links, poses, ball_axes()), closes=True))
 
 
 # --- couplings of generalized_rbda ---------------------------------------------------------------------------------
@@ -189,11 +164,6 @@ def add_gazebo(robot: Robot, root: Element, unread: Counter[str]) -> list[str]:
     """Add the joints, springs and couplings of <gazebo> elements, and return what they are called.
 
     Gazebo places a joint in its child, at the poses of the links at zero.
-
-    Raises
-    ------
-    InputError, MechanismError
-        A number is malformed, a type is unknown, or a link does not exist.
     """
     dialects = []
     for gazebo in root.findall("gazebo"):

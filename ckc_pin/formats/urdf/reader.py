@@ -18,7 +18,7 @@ from ckc_pin.formats.urdf.closing_frames import find_closing_frames
 from ckc_pin.formats.urdf.elements import INERTIA_ENTRIES, parse_origin
 from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML, add_loop_closures_yaml
 from ckc_pin.formats.urdf.loops import LOOP_TAGS, add_gazebo, add_loops
-from ckc_pin.formats.urdf.motors import MOTOR_TAGS, add_motors
+from ckc_pin.formats.urdf.motors import MOTOR_TAGS, add_control_mimics, add_motors
 from ckc_pin.formats.urdf.robot_yaml import add_robot_yaml
 from ckc_pin.mechanism.urdf import by_name, check_single_elements, floats
 
@@ -52,14 +52,8 @@ def read_urdf(text: str, path: Path) -> Robot:
     text : str
     path : Path
         File of the text. A robot.yaml or loop_closures.yaml in the same folder belongs to it.
-
-    Raises
-    ------
-    InputError, MechanismError
-        The text is not a valid URDF, or an element names a link or joint that does not exist.
     """
     root, source = parse_xml(text, str(path)), str(path)
-    _refuse_xacro(root, path)
     robot = Robot(name=choose_name(path, root.get("name", "")), origin=f"{path.name}, a URDF", source=source)
     robot.materials = root.findall("material")
     unread = Counter(f"<{e.tag}>" for e in root if e.tag not in READ["robot"])
@@ -84,6 +78,7 @@ def read_urdf(text: str, path: Path) -> Robot:
         if robot.loops or robot.untyped:
             robot.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
     _set_independent(robot, root)
+    add_control_mimics(robot, root)
     _check_mimics(robot)
     add_motors(robot, root, unread)
     robot.leave_out(unread)
@@ -104,27 +99,13 @@ def read_urdf(text: str, path: Path) -> Robot:
 
 
 def find_urdf_beside(path: Path) -> Path:
-    """Return the URDF to which a robot.yaml or loop_closures.yaml belongs.
-
-    Raises
-    ------
-    InputError
-        The folder has no URDF, or several and none of them is robot.urdf.
-    """
+    """Return the URDF to which a robot.yaml or loop_closures.yaml belongs."""
     urdfs = sorted(path.parent.glob("*.urdf"))
     candidates = [p for p in urdfs if p.name == "robot.urdf"] or urdfs
     if len(candidates) != 1:
         names = ", ".join(p.name for p in urdfs) or "none"
         raise InputError(f"{path}: expected one URDF in the same folder, got {names}; import the URDF itself instead")
     return candidates[0]
-
-
-def _refuse_xacro(root: Element, path: Path) -> None:
-    for element in root.iter():
-        if "xacro" in element.tag or any("${" in value for value in element.attrib.values()):
-            raise InputError(
-                f"{path}: this is a xacro file, not a URDF; expand it first with `xacro FILE > robot.urdf`"
-            )
 
 
 # --- links and joints ----------------------------------------------------------------------------------------------

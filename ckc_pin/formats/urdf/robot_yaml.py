@@ -40,13 +40,6 @@ def add_robot_yaml(robot: Robot, text: str, source: str) -> None:
     text : str
     source : str
         Name of the file in messages.
-
-    Raises
-    ------
-    InputError
-        Malformed YAML, or a value of the wrong type.
-    MechanismError
-        A frame, joint or loop type that does not exist.
     """
     content, unknown_keys = parse_yaml(text, RobotYaml, source)
     robot.left_out += [f"{source}: unsupported key {key!r}" for key in unknown_keys]
@@ -55,7 +48,7 @@ def add_robot_yaml(robot: Robot, text: str, source: str) -> None:
         raise InputError(f"{source}: joint_name has {counts}; they must have the same number")
     for joint, kind in zip(content.joint_name, content.joint_type, strict=True):
         _substitute(robot, joint, kind, source)
-    hinges = [joint.name for joint in robot.moving_joints() if "spherical" in joint.name and len(joint.axes) == 1]
+    hinges = [name for name, joint in robot.joints.items() if "spherical" in name and len(joint.axes) == 1]
     if hinges:
         remedy = "if they are ball joints, add them to joint_name with joint_type SPHERICAL and import again"
         robot.guessed.append(

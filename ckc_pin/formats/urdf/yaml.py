@@ -25,13 +25,7 @@ ALIAS = re.compile(r"(^|[\s\[{,:-])[&*]\w", re.MULTILINE)
 
 
 def parse_yaml(text: str, kind: type[T], source: str) -> tuple[T, list[str]]:
-    """Return a file's content, and the keys that the structure does not have.
-
-    Raises
-    ------
-    InputError
-        Malformed YAML, or a value of the wrong type.
-    """
+    """Return a file's content, and the keys that the structure does not have."""
     if len(text) > MAX_CHARACTERS:
         raise InputError(f"{source}: more than {MAX_CHARACTERS} characters, too large for such a file")
     depth = max(accumulate((c in "[{") - (c in "]}") for c in text), default=0)
