@@ -22,7 +22,14 @@ from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.motors import Motors
 from ckc_pin.mechanism.pose import Anchors, Pose
-from ckc_pin.mechanism.rank import Freedoms, choose_dependent, compute_rank, idle_coordinates, scale_jacobian
+from ckc_pin.mechanism.rank import (
+    Freedoms,
+    choose_dependent,
+    choose_dependent_by_priority,
+    compute_rank,
+    idle_coordinates,
+    scale_jacobian,
+)
 from ckc_pin.mechanism.spec import CouplingSpec, ForceSpec, JointSpec, LoopSpec, MotorSpec, PointSpec, SpringSpec
 
 __all__ = ["CONSTRAINED_IN_PART", "Mechanism"]
@@ -357,18 +364,20 @@ class Mechanism(HasSummary):
     def _choose_independent(self, motors: Motors | None, preset: Sequence[str] | None) -> None:
         """Choose q and z, or check a preset choice."""
         coordinates = set(range(self.n))
-        chosen = None if self.freedoms.dependent is None else set(self.freedoms.dependent.tolist())
-        best = [self.coordinates[k] for k in sorted(coordinates - (chosen or set()))]
-        remedy = f"; {', '.join(best) or 'none'} would do" if chosen is not None else ""
-        if chosen is None:  # every choice splits the six coordinates of a free root
+        splits_roots = self.freedoms.dependent is None  # every choice splits the six coordinates of a free root
+        if splits_roots:
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
             best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
+        else:
+            best = self._prefer(np.zeros(0, np.intp) if motors is None else motors.driven_coordinates())
+        remedy = "" if splits_roots else f"; {', '.join(best) or 'none'} would do"
         if preset is not None:
             names = [name for name in preset if name not in self.prescribed]
             if self.prescribed and len(names) > self.d:  # each prescribed joint takes one freedom away
-                names = self._prefer(self.tree.indices(tuple(names), "independent"), best)[: self.d]
+                at = self.tree.indices(tuple(names), "independent")
+                names = (best if splits_roots else self._prefer(at))[: self.d]
         else:
-            names = self._prefer_driven(best, motors)
+            names = best
         at = self.tree.indices(tuple(names), "independent")
         if len(set(names)) != len(names):
             raise MechanismError(f"independent: a coordinate is named twice in {names}")
@@ -384,7 +393,7 @@ class Mechanism(HasSummary):
                 f"(phi_z is singular there){remedy}"
             )
         self.splits_root = any(0 < sum(v_at <= k < v_at + 6 for k in at) < 6 for _, v_at in self.tree.free_roots)
-        if self.splits_root and chosen is not None:
+        if self.splits_root and not splits_roots:
             raise MechanismError(
                 f"independent: the six coordinates of a free root are all independent or all dependent{remedy}"
             )
@@ -393,16 +402,6 @@ class Mechanism(HasSummary):
         self.independent = tuple(names)
         self.dependent = tuple(self.coordinates[k] for k in z)
         self.partition = Partition(at, z)
-
-    def _prefer_driven(self, best: list[str], motors: Motors | None) -> list[str]:
-        """Return independent coordinates: those with motors as far as phi_z stays well conditioned, then others."""
-        if motors is None or not motors.names or self.freedoms.dependent is None:
-            return best
-        driven = np.flatnonzero(motors.transmission.any(axis=0))
-        driven = driven[
-            np.argsort(np.argmax(motors.transmission[:, driven] != 0, axis=0), kind="stable")
-        ]  # in tau's order
-        return self._prefer(driven, best)
 
     def complete_independent(self, names: Sequence[str]) -> tuple[str, ...] | None:
         """Return independent coordinates that contain these; None if the loops couple them where it is assembled."""
@@ -413,12 +412,22 @@ class Mechanism(HasSummary):
             return None
         return (*names, *(self.coordinates[k] for i, k in enumerate(others) if i not in dependent))
 
-    def _prefer(self, preferred: IntArray, best: list[str]) -> list[str]:
+    def _prefer(self, driven: IntArray) -> list[str]:
+        """Return independent coordinates: the driven ones as far as phi_z stays well conditioned, then by position.
+
+        Of the others, coordinates that follow another one by a coupling are dependent if possible, then those
+        furthest from the root, then the last.
+        """
+        depth, parents = [0], list(self.tree.model.parents)
+        for joint in range(1, len(parents)):
+            depth.append(depth[parents[joint]] + 1)
+        followers = {coupling.joint for coupling in self.couplings}
+        rank_of = [(name in followers, depth[self.tree.parent_joint[k]]) for k, name in enumerate(self.coordinates)]
+        order = sorted(range(self.n), key=lambda k: (*rank_of[k], k))
         blocks = [np.arange(v, v + 6) for _, v in self.tree.free_roots]
-        z = choose_dependent(self.freedoms.jacobian, self.rank, blocks, preferred)
-        if z is None:
-            return best
-        first = [int(k) for k in preferred if k not in z]
+        z = choose_dependent_by_priority(self.freedoms.jacobian, self.rank, order, driven.tolist(), blocks)
+        assert z is not None  # as freedoms.dependent
+        first = [int(k) for k in driven if k not in z]
         return [self.coordinates[k] for k in [*first, *(k for k in range(self.n) if k not in {*z, *first})]]
 
     def _choose_motors(self, motors: Motors | None) -> None:

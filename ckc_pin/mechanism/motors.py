@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.validation import is_number, suggest_name
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.mechanism.spec import MechanismSpec, MotorSpec
@@ -87,6 +87,11 @@ class Motors:
         driven = self.transmission != 0.0
         alone = np.flatnonzero(driven[:, coordinate] & (driven.sum(axis=1) == 1))
         return int(alone[0]) if len(alone) else None
+
+    def driven_coordinates(self) -> IntArray:
+        """Return the coordinates that a motor drives, in the order of the motors."""
+        driven = np.flatnonzero(self.transmission.any(axis=0))
+        return driven[np.argsort(np.argmax(self.transmission[:, driven] != 0, axis=0), kind="stable")]
 
     def force(self, tau: Array) -> Array:
         """Return the generalized force u' of motor torques on the tree, shape (n,)."""

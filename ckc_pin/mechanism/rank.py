@@ -18,6 +18,7 @@ __all__ = [
     "Freedoms",
     "RankReport",
     "choose_dependent",
+    "choose_dependent_by_priority",
     "compute_rank",
     "count_freedoms",
     "idle_coordinates",
@@ -27,7 +28,9 @@ __all__ = [
 ]
 
 RANK_TOLERANCE = 1e-5  # of the largest singular value; numbers in files are rounded to six digits
-MIN_PIVOT = 0.03  # of the largest column; below it a preferred independent coordinate becomes dependent after all
+# Part of a column of J that is orthogonal to the columns chosen before, relative to the column: a coordinate becomes
+# dependent in its turn above the first, and instead of a driven one above the second.
+GOOD_PIVOT, MIN_PIVOT = 0.2, 0.03
 ROUNDING_LEVEL = 1e-9  # singular values between this and RANK_TOLERANCE make the rank uncertain
 
 
@@ -83,9 +86,7 @@ def redundant_rows(scaled_jacobian: Array, rank: int) -> IntArray:
     return np.sort(order[rank:])
 
 
-def choose_dependent(
-    scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = (), preferred: Sequence[int] | IntArray = ()
-) -> IntArray | None:
+def choose_dependent(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray] = ()) -> IntArray | None:
     """Choose the dependent coordinates z so that phi_z is well conditioned, by a pivoted QR.
 
     Of equally good coordinates the last becomes dependent, since motors are mostly at the beginning of the tree.
@@ -96,42 +97,83 @@ def choose_dependent(
     rank : int
     blocks : sequence of index arrays
         Coordinates of free roots, which are all dependent or all independent. Dependent is tried first.
-    preferred : sequence of int
-        Coordinates that become dependent only if phi_z would be nearly singular without them.
 
     Returns
     -------
     (rank,) int array, or None if a block would have to be split.
     """
-    if rank == 0:
-        return np.zeros(0, np.intp)
+    inside, rest = _split_blocks(scaled_jacobian, rank, blocks)
+    if inside is None:
+        return None
+    remainder = scaled_jacobian[:, rest]
+    if len(inside):  # Choose the others by their parts orthogonal to the blocks.
+        q, _ = np.linalg.qr(scaled_jacobian[:, inside])
+        remainder = remainder - q @ (q.T @ remainder)
+    pivots = pivoted_columns(remainder)[0][: rank - len(inside)]
+    return np.sort(np.concatenate([inside, rest[pivots]]).astype(np.intp))
+
+
+def choose_dependent_by_priority(
+    scaled_jacobian: Array, rank: int, order: Sequence[int], driven: Sequence[int], blocks: Sequence[IntArray] = ()
+) -> IntArray | None:
+    """Choose the dependent coordinates z from the end of a fixed order, driven coordinates last.
+
+    A coordinate becomes dependent if its column of J has a large part orthogonal to the columns chosen before. The
+    choice therefore does not change with small changes of the configuration, unlike that of a pivoted QR.
+
+    Parameters
+    ----------
+    scaled_jacobian : (rows, n) array
+    rank : int
+    order : sequence of int
+        All coordinates; those that should be independent first.
+    driven : sequence of int
+        Coordinates that become dependent only if phi_z would be nearly singular without them, the last first.
+    blocks : sequence of index arrays
+        Coordinates of free roots, which are all dependent or all independent. Dependent is tried first.
+
+    Returns
+    -------
+    (rank,) int array, or None if a block would have to be split.
+    """
+    inside, rest = _split_blocks(scaled_jacobian, rank, blocks)
+    if inside is None:
+        return None
+    z: list[int] = []
+    remainder, sizes = scaled_jacobian.copy(), np.linalg.norm(scaled_jacobian, axis=0)
+
+    def make_dependent(k: int) -> None:
+        direction = remainder[:, k] / np.linalg.norm(remainder[:, k])
+        remainder[:] -= np.outer(direction, direction @ remainder)
+        remainder[:, k] = 0.0
+        z.append(k)
+
+    for k in inside[pivoted_columns(scaled_jacobian[:, inside])[0]] if len(inside) else ():
+        make_dependent(int(k))
+    candidates = [k for k in reversed(order) if k in set(rest.tolist())]
+    others = [k for k in candidates if k not in driven]
+    last = [k for k in reversed(driven) if k in candidates]
+    for group, threshold in ((others, GOOD_PIVOT), (others, MIN_PIVOT), (last, GOOD_PIVOT)):
+        for k in group:
+            limit = max(threshold * sizes[k], RANK_TOLERANCE * sizes.max(initial=0.0))
+            if len(z) < rank and float(np.linalg.norm(remainder[:, k])) > limit:
+                make_dependent(k)
+    while len(z) < rank:
+        make_dependent(int(np.argmax(np.linalg.norm(remainder, axis=0))))
+    return np.sort(np.array(z, dtype=np.intp))
+
+
+def _split_blocks(scaled_jacobian: Array, rank: int, blocks: Sequence[IntArray]) -> tuple[IntArray | None, IntArray]:
+    """Return the dependent coordinates of blocks, None if a block would be split, and the others, the last first."""
     rest = np.arange(scaled_jacobian.shape[1])[::-1]
-    if len(blocks):
-        inside = np.concatenate(blocks).astype(np.intp)
-        rest = np.setdiff1d(rest, inside)[::-1]
-        _, pivots = pivoted_columns(scaled_jacobian[:, inside])
-        if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
-            # The blocks are dependent. Choose the others by their parts orthogonal to the blocks.
-            q, _ = np.linalg.qr(scaled_jacobian[:, inside])
-            remainder = scaled_jacobian[:, rest] - q @ (q.T @ scaled_jacobian[:, rest])
-            return np.sort(np.concatenate([inside, _choose_columns(remainder, rank - len(inside), rest, preferred)]))
-        if compute_rank(scaled_jacobian[:, rest]).rank < rank:
-            return None
-    return np.sort(_choose_columns(scaled_jacobian[:, rest], rank, rest, preferred))
-
-
-def _choose_columns(matrix: Array, count: int, labels: IntArray, avoided: Sequence[int] | IntArray) -> IntArray:
-    """Return the labels of `count` columns chosen by a pivoted QR, columns to avoid last."""
-    first = np.flatnonzero(~np.isin(labels, avoided))
-    if not 0 < len(first) < len(labels):
-        return labels[pivoted_columns(matrix)[0][:count]]
-    order, pivots = pivoted_columns(matrix[:, first])
-    largest = np.linalg.norm(matrix, axis=0).max(initial=0.0)
-    first = first[order[: min(count, int(np.sum(pivots > MIN_PIVOT * largest)))]]
-    q, _ = np.linalg.qr(matrix[:, first])
-    others = np.setdiff1d(np.arange(len(labels)), first)
-    remainder = matrix[:, others] - q @ (q.T @ matrix[:, others])
-    return labels[np.concatenate([first, others[pivoted_columns(remainder)[0][: count - len(first)]]])]
+    if not len(blocks) or not rank:
+        return np.zeros(0, np.intp), rest
+    inside = np.concatenate(blocks).astype(np.intp)
+    rest = np.setdiff1d(rest, inside)[::-1]
+    _, pivots = pivoted_columns(scaled_jacobian[:, inside])
+    if len(pivots) == len(inside) and pivots[-1] > RANK_TOLERANCE * pivots[0]:
+        return inside, rest
+    return None if compute_rank(scaled_jacobian[:, rest]).rank < rank else np.zeros(0, np.intp), rest
 
 
 IDLE_TOLERANCE = 1e-6  # of the largest motion; a centre of mass rounded to six digits counts as on its axis

@@ -360,8 +360,9 @@ class MechanismSpec(FileStruct, frozen=True):
         Acceleration of gravity in world axes.
         ``gravity = [0.0, -9.81, 0.0]``
     independent
-        The independent coordinates q, in the order of u, D, C, h and matrix gains. Default: chosen by a pivoted
-        factorization, which prefers coordinates with motors as far as φ_z stays well conditioned.
+        The independent coordinates q, in the order of u, D, C, h and matrix gains. Default: those with
+        motors as far as φ_z stays well conditioned, then those nearest the root. The choice does not depend on stops or
+        on small changes of ``q_guess``.
         ``independent = ["theta_1", "theta_3"]``
     actuated
         Joints with a motor of the same name and without a gear, in the order of tau, instead of ``[[motor]]``.

@@ -182,14 +182,13 @@ def test_two_connects_at_different_distances_stay_points(tmp_path: Path) -> None
 
 def test_unsupported_equalities_and_tendons_are_noted(tmp_path: Path) -> None:
     equality = """<equality><connect name="off" site1="s1" site2="t1" active="false"/>
-      <joint name="cam" joint1="a" joint2="b" polycoef="0 1 0.5 0 0"/><tendon name="cable" tendon1="x"/></equality>
+      <tendon name="cable" tendon1="x"/></equality>
       <tendon><spatial name="x" limited="true" range="0 3"><site site="s1"/><site site="t1"/><site site="t2"/></spatial>
       </tendon><contact><exclude body1="left" body2="right"/></contact>"""
     draft = model(tmp_path, TWO_ARMS, equality)
     assert not draft.loops
     assert not draft.couplings
     assert has_note(draft.left_out, "off", "not active")
-    assert has_note(draft.left_out, "joints a and b", "not linear")
     assert has_note(draft.left_out, "<tendon> cable")
     assert has_note(draft.left_out, "a limit of tendon x")
     assert has_note(draft.left_out, "contact pairs")

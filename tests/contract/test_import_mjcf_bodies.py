@@ -171,19 +171,17 @@ def test_disabled_friction_and_ranges_are_noted(tmp_path: Path, flag: str) -> No
 
 
 def test_unsupported_armature_is_noted(tmp_path: Path) -> None:
-    """Of free and ball joints and of tendons, and of actuators on these."""
+    """Of free and ball joints and of tendons."""
     bodies = """<body name='f'><joint name='free' type='free' armature='0.1'/><geom size='.1'/></body>
       <body name='c'><joint name='ball' type='ball'/><geom size='.1'/></body>
       <body name='d'><joint name='d'/><geom size='.1'/></body>"""
     rest = """<tendon><fixed name='belt' armature='0.2'><joint joint='d' coef='2'/></fixed></tendon>
-      <actuator><motor name='turn' joint='ball' gear='3 0 0' armature='0.1'/>
-      <motor name='pull' tendon='belt' armature='0.1'/></actuator>"""
+      <actuator><motor name='turn' joint='ball' gear='3 0 0' armature='0.1'/></actuator>"""
     draft = model(tmp_path, bodies, rest)
     assert not draft.joints
     assert has_note(draft.left_out, "armature of free joint free")
     assert has_note(draft.left_out, "armature of ball joint ball")
     assert has_note(draft.left_out, "armature of tendon belt")
-    assert has_note(draft.left_out, "actuator pull on tendon belt, with its armature")
 
 
 def test_unsupported_properties_of_joints_and_tendons_are_noted(tmp_path: Path) -> None:
@@ -207,7 +205,7 @@ def test_gears_and_limits_of_motors_are_imported(tmp_path: Path) -> None:
       <general name="right" joint="b" gainprm="3" ctrlrange="-2 2" ctrllimited="true"/>"""
     draft = model(tmp_path, TWO_ARMS, f"<actuator>{actuators}</actuator>")
     assert [spec for spec, _ in draft.motors] == [
-        MotorSpec(name="left", joint="a", ratio=-20.0, torque_limit=1.5),
+        MotorSpec(name="left", joint="a", ratio=-20.0, torque_limit=[-1.5, 2.0]),
         MotorSpec(name="right", joint="b", torque_limit=6.0),
     ]
     assert draft.left_out == []

@@ -11,6 +11,7 @@ from itertools import groupby
 
 import numpy as np
 import pinocchio as pin
+from numpy.polynomial import Polynomial
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.formats.conversion import from_quaternion, make_frame, make_unique, round_number, round_vector
@@ -20,6 +21,8 @@ from ckc_pin.mechanism.spec import CouplingSpec, Frame, LoopSpec, SpringSpec
 
 __all__ = ["Equalities", "Tendons"]
 
+# A fixed tendon whose limits are closer together ties its joints, rad or m.
+MAX_TIED_RANGE = 0.01
 # Two connects between the same bodies are a hinge if their distance is equal on both bodies, up to a file's digits.
 DISTANCE_TOLERANCE = 1e-4  # relative
 
@@ -51,7 +54,8 @@ class _Tendon:
 class Tendons:
     """The tendons of a compiled model.
 
-    A straight line between two sites with stiffness or damping is a spring. Other tendons that act are left out.
+    A straight line between two sites with stiffness or damping is a spring. A fixed tendon with limits close together
+    is a coupling (`Equalities`). Other tendons that act are left out.
 
     Attributes
     ----------
@@ -68,6 +72,12 @@ class Tendons:
         """Joints of fixed tendons."""
         return {joint for tendon in self.tendons for joint, _ in tendon.joints}
 
+    def tied_length(self, tendon: _Tendon) -> float | None:
+        """Return the middle of a fixed tendon's limits if they are so close together that they tie its joints."""
+        lower, upper = (float(x) for x in self.compiled.model.tendon_range[tendon.number])
+        is_limited = tendon.joints and self.compiled.model.tendon_limited[tendon.number]
+        return (lower + upper) / 2 if is_limited and 0 <= upper - lower < MAX_TIED_RANGE else None
+
     def springs(self, tree: MjcfTree) -> tuple[list[tuple[SpringSpec, str]], list[str]]:
         """Return the springs between frames with comments, and notes on properties that are left out."""
         model, springs, left_out = self.compiled.model, [], []
@@ -76,7 +86,7 @@ class Tendons:
             shortest, longest = (float(x) for x in model.tendon_lengthspring[k])
             stiffness, damping = float(model.tendon_stiffness[k]), float(model.tendon_damping[k])
             unsupported = {
-                "a limit": model.tendon_limited[k],
+                "a limit": model.tendon_limited[k] and self.tied_length(tendon) is None,
                 "dry friction": model.tendon_frictionloss[k],
                 "armature": model.tendon_armature[k],
                 "stiffness or damping of higher order": np.any(model.tendon_stiffnesspoly[k])
@@ -138,13 +148,14 @@ class Equalities:
     Attributes
     ----------
     loops, couplings : list of (spec, comment)
-    left_out : list of str
+    guessed, left_out : list of str
     """
 
     def __init__(self, compiled: Compiled, tree: MjcfTree, tendons: Tendons) -> None:
         self.compiled, self.tree, self.tendons = compiled, tree, tendons
         self.loops: list[tuple[LoopSpec, str]] = []
         self.couplings: list[tuple[CouplingSpec, str]] = []
+        self.guessed: list[str] = []
         self.left_out: list[str] = []
         model, kinds = compiled.model, compiled.mujoco.mjtEq
         tags = {int(kinds.mjEQ_CONNECT): "connect", int(kinds.mjEQ_WELD): "weld", int(kinds.mjEQ_JOINT): "joint"}
@@ -160,6 +171,8 @@ class Equalities:
                 self._add_joint_equality(k)
             else:
                 self._add_tendon_equality(k, name)
+        for tendon in tendons.tendons:
+            self._add_tight_limit(tendon)
         for group in _group_by_links(closures):
             self._add_loops(group)
 
@@ -185,46 +198,58 @@ class Equalities:
         return _Closure(name or f"{names[0]}_{names[1]}", "point" if only_translation else "weld", a, b, comment)
 
     def _add_joint_equality(self, k: int) -> None:
-        """Add joint1 - ref1 = c0 + c1 (joint2 - ref2) as a coupling; higher powers are unsupported."""
+        """Add joint1 - ref1 = p(joint2 - ref2), p a polynomial, as a coupling."""
         model, names = self.compiled.model, self.compiled.joints
         joint, other = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
-        polynomial = [float(x) for x in model.eq_data[k, :5]]
+        powers = [float(x) for x in model.eq_data[k, :5]]
         if any(j >= 0 and j not in self.tree.ref for j in (joint, other)):
             self.left_out.append(f"equality of joint {names[joint]}, which is not a hinge or slide of its own")
         elif other < 0:
-            self._fix_joint(joint, self.tree.ref[joint] + polynomial[0])
-        elif any(polynomial[2:]):
-            self.left_out.append(
-                f"equality of joints {names[joint]} and {names[other]}: its polynomial {polynomial} is not linear; "
-                "a [[coupling]] at one angle may replace it"
-            )
+            value = self.tree.ref[joint] + powers[0]
+            spec = CouplingSpec(joints={names[joint]: 1.0}, offset=round_number(value))
+            self.couplings.append((spec, f"fixes {names[joint]} at a value"))
+        elif any(powers[2:]):
+            shifted = Polynomial(powers)(Polynomial([-self.tree.ref[other], 1.0])) + self.tree.ref[joint]
+            coefficients = [round_number(float(x)) for x in shifted.trim().coef]
+            spec = CouplingSpec(joint=names[joint], other=names[other], polynomial=coefficients)
+            self.couplings.append((spec, "joint equality"))
         else:
-            ratio = polynomial[1]
-            offset = self.tree.ref[joint] + polynomial[0] - ratio * self.tree.ref[other]
-            self._add_coupling(joint, other, ratio, offset, "joint equality")
+            ratio = powers[1]
+            offset = self.tree.ref[joint] + powers[0] - ratio * self.tree.ref[other]
+            self._add_gear(joint, other, ratio, offset, "joint equality")
 
-    def _fix_joint(self, joint: int, value: float) -> None:
-        """Fix a joint at a value by a coupling of ratio 0 to any other joint."""
-        names = self.compiled.joints
-        other = next((j for j in self.tree.ref if j != joint), None)
-        if other is None:
-            self.left_out.append(
-                f"joint {names[joint]} is fixed at {value:g} by an equality, but a [[coupling]] needs a second joint; "
-                "make it a fixed joint of the URDF"
-            )
-            return
-        comment = f"fixes {names[joint]} at a value; with a ratio of 0, {names[other]} has no influence"
-        self._add_coupling(joint, other, 0.0, value, comment)
-
-    def _add_coupling(self, joint: int, other: int, ratio: float, offset: float, comment: str) -> None:
+    def _add_gear(self, joint: int, other: int, ratio: float, offset: float, comment: str) -> None:
         names = self.compiled.joints
         spec = CouplingSpec(
             joint=names[joint], other=names[other], ratio=round_number(ratio), offset=round_number(offset)
         )
         self.couplings.append((spec, comment))
 
+    def _add_sum(self, joints: list[tuple[int, float]], length: float, name: str, comment: str) -> None:
+        """Add a coupling that holds a sum of coefficient * joint at a length."""
+        if len(joints) == 2:
+            (joint, coefficient), (other, other_coefficient) = joints
+            self._add_gear(joint, other, -other_coefficient / coefficient, length / coefficient, comment)
+            return
+        coefficients = {self.compiled.joints[joint]: round_number(x) for joint, x in joints}
+        unique = make_unique(name or "sum", [spec.name or "" for spec, _ in self.couplings])
+        self.couplings.append((CouplingSpec(name=unique, joints=coefficients, offset=round_number(length)), comment))
+
+    def _add_tight_limit(self, tendon: _Tendon) -> None:
+        """Add a tendon whose limits are close together as a coupling at their middle."""
+        length, joints = self.tendons.tied_length(tendon), self._tied_joints(tendon)
+        if length is None:
+            return
+        label = f"tendon {tendon.name or tendon.number}"
+        if joints is None:
+            self.left_out.append(f"a limit of {label}")
+            return
+        comment = f"{label}, whose limits are closer together than {MAX_TIED_RANGE:g}"
+        self._add_sum(joints, length, tendon.name, comment)
+        self.guessed.append(f"the limits of {label} are so close that it is a coupling at their middle, {length:g}")
+
     def _add_tendon_equality(self, k: int, name: str) -> None:
-        """Add a tendon of constant length: a distance between two sites, or a coupling of two joints."""
+        """Add a tendon of constant length: a distance between two sites, or a coupling of its joints."""
         model = self.compiled.model
         tendon = self.tendons.tendons[int(model.eq_obj1id[k])]
         is_constant = not model.eq_data[k, 1:5].any() or model.eq_obj2id[k] < 0
@@ -241,16 +266,15 @@ class Equalities:
                 length=round_number(length),
             )
             self.loops.append((spec, comment))
-        elif is_constant and self._is_gear(tendon):
-            (joint, coefficient), (other, other_coefficient) = tendon.joints
-            self._add_coupling(joint, other, -other_coefficient / coefficient, length / coefficient, comment)
+        elif is_constant and (joints := self._tied_joints(tendon)) is not None:
+            self._add_sum(joints, length, tendon.name, comment)
         else:
             self.left_out.append(f"equality <tendon> {label}".rstrip())
 
-    def _is_gear(self, tendon: _Tendon) -> bool:
-        """Whether a fixed tendon couples two joints of one freedom each."""
-        joints = tendon.joints
-        return len(joints) == 2 and joints[0][1] != 0 and all(joint in self.tree.ref for joint, _ in joints)
+    def _tied_joints(self, tendon: _Tendon) -> list[tuple[int, float]] | None:
+        """Return the joints of a fixed tendon with coefficients; None if one has several freedoms or there are none."""
+        joints = [(joint, coefficient) for joint, coefficient in tendon.joints if coefficient != 0]
+        return joints if joints and all(joint in self.tree.ref for joint, _ in joints) else None
 
     def _add_loops(self, group: list[_Closure]) -> None:
         """Add the loops between two links. Two points at the same distance on both links are a hinge."""

@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.formats.conversion import choose_name, list_names, make_frame, round_number, round_vector
+from ckc_pin.formats.conversion import (
+    choose_name,
+    list_names,
+    make_frame,
+    make_unique,
+    round_number,
+    round_vector,
+)
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.mjcf.constraints import Equalities, Tendons
 from ckc_pin.formats.mjcf.document import Document
@@ -47,7 +54,7 @@ def read_mjcf(text: str, path: Path) -> Robot:
     tree = MjcfTree(compiled, in_equalities | _actuated_joints(compiled) | tendons.used_joints)
     equalities = Equalities(compiled, tree, tendons)
     springs, tendon_notes = tendons.springs(tree)
-    actuators = _Actuators(compiled, tree)
+    actuators = _Actuators(compiled, tree, tendons)
     name = choose_name(path, document.root.get("model", ""))
     has_medium = any(model.opt.wind) or model.opt.density or model.opt.viscosity
     disabled = _disabled_features(compiled)
@@ -67,7 +74,10 @@ def read_mjcf(text: str, path: Path) -> Robot:
         gravity=round_vector((0.0, 0.0, 0.0) if "gravity" in disabled else model.opt.gravity),
         q_guess=tree.q_guess,
         key_frames=tree.key_frames,
-        guessed=tree.guessed + [f"MuJoCo warns: {warning}" for warning in compiled.warnings],
+        guessed=tree.guessed
+        + equalities.guessed
+        + actuators.guessed
+        + [f"MuJoCo warns: {warning}" for warning in compiled.warnings],
         left_out=[
             *tree.left_out,
             *equalities.left_out,
@@ -107,40 +117,113 @@ class _Actuators:
     Attributes
     ----------
     joints : list of str
-        Joints with a motor.
+        Joints with a motor of their own.
     motors : list of MotorSpec
-        One for each joint; empty if all of them are direct drives without limits, which `actuated` expresses.
+        One for each joint or fixed tendon; empty if all of them are direct drives without limits, which `actuated`
+        expresses.
     forces : list of (ForceSpec, comment)
-    left_out : list of str
+    guessed, left_out : list of str
     """
 
-    def __init__(self, compiled: Compiled, tree: MjcfTree) -> None:
+    def __init__(self, compiled: Compiled, tree: MjcfTree, tendons: Tendons) -> None:
+        self.compiled, self.tree = compiled, tree
         self.joints: list[str] = []
         self.forces: list[tuple[ForceSpec, str]] = []
+        self.guessed: list[str] = []
         self.left_out: list[str] = []
-        motors: list[MotorSpec] = []
-        with_gains = []
+        self.motors: list[MotorSpec] = []
+        with_gains: list[str] = []
         for k in range(compiled.model.nactuator):
-            joint = _joint_of(compiled, k)
+            joints = _driven_joints(compiled, tendons, k)
             name = compiled.name("actuator", k)
-            if joint is None or joint not in tree.ref:
-                target = "a joint of several freedoms" if joint is not None else _describe_target(compiled, k)
-                rotor = ", with its armature" if joint is None and compiled.model.actuator_armature[k] else ""
+            if not joints or not set(joints) <= set(tree.ref):
+                target = (
+                    "a joint of several freedoms"
+                    if _joint_of(compiled, k) is not None
+                    else _describe_target(compiled, k)
+                )
+                rotor = ", with its armature" if not joints and compiled.model.actuator_armature[k] else ""
                 self.left_out.append(f"actuator {name} on {target}{rotor}".replace("  ", " "))
-            elif value := _constant_force(compiled, k):
-                spec = ForceSpec(joint=compiled.joints[joint], value=round_number(value))
-                self.forces.append((spec, f"actuator {name}, which has no control input".replace("  ", " ")))
-            else:
-                if compiled.joints[joint] not in self.joints:
-                    self.joints.append(compiled.joints[joint])
-                    motors.append(_motor(compiled, k, compiled.joints[joint]))
-                with_gains += [] if _is_direct_drive(compiled, k) else [compiled.joints[joint]]
-        has_duplicate_names = len({motor.name for motor in motors}) < len(motors)
-        all_direct = all(motor.ratio == 1.0 and motor.torque_limit is None for motor in motors)
-        self.motors = [] if has_duplicate_names or all_direct else motors
+                continue
+            names = [compiled.joints[joint] for joint in joints]
+            if value := _constant_force(compiled, k):
+                comment = f"actuator {name}, which has no control input".replace("  ", " ")
+                for joint, x in joints.items():
+                    self.forces.append(
+                        (ForceSpec(joint=compiled.joints[joint], value=round_number(value * x)), comment)
+                    )
+                continue
+            if len(names) > 1 or names[0] not in self.joints:
+                self.joints += names if len(names) == 1 else []
+                self._add_motor(k, joints)
+            with_gains += [] if _is_direct_drive(compiled, k) else names
+        if all(motor.joint is not None and motor.ratio == 1.0 and motor.torque_limit is None for motor in self.motors):
+            self.motors = []
         if with_gains:
-            joints = list_names(list(dict.fromkeys(with_gains)))
-            self.left_out.append(f"gains and curves of actuators, whose joints have motors instead: {joints}")
+            listed = list_names(list(dict.fromkeys(with_gains)))
+            self.left_out.append(f"gains and curves of actuators, whose joints have motors instead: {listed}")
+
+    def _add_motor(self, k: int, joints: dict[int, float]) -> None:
+        """Add an actuator as a motor. The armature of a joint includes that of the joint's actuator already."""
+        model, names = self.compiled.model, self.compiled.joints
+        first = names[next(iter(joints))]
+        name = make_unique(self.compiled.name("actuator", k) or first, [str(motor.name) for motor in self.motors])
+        ratio = round_number(float(model.actuator_gear[k, 0])) or 1.0
+        limits = _torque_limits(self.compiled, k, joints)
+        if limits[0] > 0 or limits[1] < 0 or limits[0] == limits[1]:
+            self.left_out.append(f"torque limits {limits[0]:g} to {limits[1]:g} of actuator {name}, which exclude 0")
+            limits = -math.inf, math.inf
+        if _joint_of(self.compiled, k) is not None:
+            spec = MotorSpec(name=name, joint=first, ratio=ratio, torque_limit=_limit_of(limits))
+        else:
+            spec = MotorSpec(
+                name=name,
+                joints={names[joint]: round_number(x) for joint, x in joints.items()},
+                ratio=ratio,
+                rotor_inertia=round_number(float(model.actuator_armature[k])),
+                torque_limit=_limit_of(limits),
+            )
+            if spec.rotor_inertia and len(joints) > 1:
+                self.guessed.append(
+                    f"the rotor of motor {name} couples the inertias of all its joints; MuJoCo neglects that between "
+                    "joints of different branches"
+                )
+        self.motors.append(spec)
+
+
+def _driven_joints(compiled: Compiled, tendons: Tendons, k: int) -> dict[int, float]:
+    """Return the joints that an actuator drives, with their coefficients; empty for other targets."""
+    joint = _joint_of(compiled, k)
+    if joint is not None:
+        return {joint: 1.0}
+    if int(compiled.model.actuator_trntype[k]) != compiled.mujoco.mjtTrn.mjTRN_TENDON:
+        return {}
+    return {j: x for j, x in tendons.tendons[int(compiled.model.actuator_trnid[k, 0])].joints if x}
+
+
+def _torque_limits(compiled: Compiled, k: int, joints: dict[int, float]) -> tuple[float, float]:
+    """Return the limits of an actuator's torque before its gear: its own, and those of the joint or tendon."""
+    model = compiled.model
+    gear = float(model.actuator_gear[k, 0]) or 1.0
+    ranges = []
+    if model.actuator_forcelimited[k]:
+        ranges.append(model.actuator_forcerange[k])
+    if model.actuator_ctrllimited[k] and _is_direct_drive(compiled, k):
+        ranges.append(float(model.actuator_gainprm[k, 0]) * model.actuator_ctrlrange[k])
+    target = int(model.actuator_trnid[k, 0])
+    on = "jnt" if _joint_of(compiled, k) is not None else "tendon"
+    if getattr(model, f"{on}_actfrclimited")[target]:
+        ranges.append(getattr(model, f"{on}_actfrcrange")[target] / gear)
+    if on == "tendon":
+        ranges += [model.jnt_actfrcrange[j] / (gear * x) for j, x in joints.items() if model.jnt_actfrclimited[j]]
+    lower = max((float(min(limits)) for limits in ranges), default=-math.inf)
+    return lower, min((float(max(limits)) for limits in ranges), default=math.inf)
+
+
+def _limit_of(limits: tuple[float, float]) -> float | list[float] | None:
+    """Return lower and upper limits as the torque_limit of a motor."""
+    lower, upper = (round_number(x) if math.isfinite(x) else x for x in limits)
+    return None if math.isinf(upper) else upper if lower == -upper else [lower, upper]
 
 
 def _actuated_joints(compiled: Compiled) -> set[int]:
@@ -176,26 +259,6 @@ def _constant_force(compiled: Compiled, k: int) -> float:
     if has_input or int(model.actuator_biastype[k]) != mujoco.mjtBias.mjBIAS_AFFINE or bias[1:].any():
         return 0.0
     return float(model.actuator_gear[k, 0] * bias[0])
-
-
-def _motor(compiled: Compiled, k: int, joint: str) -> MotorSpec:
-    """Return an actuator on a joint as a motor. The joint's armature includes the actuator's already."""
-    model = compiled.model
-    limit = math.inf
-    gain = abs(float(model.actuator_gainprm[k, 0]))
-    for is_limited, bounds, scale in (
-        (model.actuator_forcelimited[k], model.actuator_forcerange[k], 1.0),
-        (model.actuator_ctrllimited[k] and _is_direct_drive(compiled, k), model.actuator_ctrlrange[k], gain),
-    ):
-        if is_limited and bounds[0] < 0 < bounds[1]:
-            limit = min(limit, scale * float(min(-bounds[0], bounds[1])))
-    gear = float(model.actuator_gear[k, 0])
-    return MotorSpec(
-        name=compiled.name("actuator", k) or joint,
-        joint=joint,
-        ratio=round_number(gear) if gear else 1.0,
-        torque_limit=round_number(limit) if math.isfinite(limit) else None,
-    )
 
 
 def _is_direct_drive(compiled: Compiled, k: int) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
 from ckc_pin.formats.loop_frames import place_in_plane
 from ckc_pin.mechanism.couplings import coefficients_of, coupling_name
@@ -68,7 +68,7 @@ def to_mjcf(mechanism: Mechanism, time_step: float = DEFAULT_TIME_STEP_S) -> tup
     _add_springs(mechanism, root, sites)
     differences += _joint_differences(mechanism)
     _add_sticks(mechanism, bodies, sites)
-    _add_actuators(mechanism, root)
+    differences += _add_actuators(mechanism, root)
     key = SubElement(root, "keyframe")
     SubElement(key, "key", name="assembled", qpos=_format(_assembled_qpos(mechanism, order)))
     indent(root)
@@ -221,11 +221,14 @@ def _add_sticks(mechanism: Mechanism, bodies: list[Element], sites: _Sites) -> N
             SubElement(bodies[joint], "geom", shape | style)
 
 
-def _add_actuators(mechanism: Mechanism, root: Element) -> None:
-    """Add motors with their gears, and constant forces. A motor on several joints acts on a fixed tendon."""
-    constant = mechanism.springs.constant
+def _add_actuators(mechanism: Mechanism, root: Element) -> list[str]:
+    """Add motors with their gears, and constant forces; return notes on what differs in MuJoCo.
+
+    A motor on several joints acts on a fixed tendon.
+    """
+    constant, notes = mechanism.springs.constant, []
     if not mechanism.actuated and not constant.any():
-        return
+        return []
     actuators = SubElement(root, "actuator")
     motors = mechanism.motors
     for name, turns, limits in zip(motors.names, motors.transmission, motors.torque_limit.T, strict=True):
@@ -236,8 +239,16 @@ def _add_actuators(mechanism: Mechanism, root: Element) -> None:
             if turns[joints[0]] != 1.0:
                 motor.set("gear", _format(turns[joints[0]]))
         else:
-            motor.set("tendon", name)
-            tendon = SubElement(_tendon_section(root), "fixed", name=name)
+            section = _tendon_section(root)
+            label = name
+            while section.find(f"*[@name={label!r}]") is not None:
+                label += "+"
+            motor.set("tendon", label)
+            tendon = SubElement(section, "fixed", name=label)
+            if rotor := next((x.rotor_inertia for x in mechanism.spec.motor if x.name == name), 0.0):
+                motor.set("armature", _format(rotor))
+                if not _is_chain(mechanism, joints):
+                    notes.append(f"the rotor of motor {name}: MuJoCo neglects that it couples joints of two branches")
             for k in joints:
                 SubElement(tendon, "joint", joint=mechanism.coordinates[k], coef=_format(turns[k]))
         if np.isfinite(limits).all():
@@ -248,6 +259,14 @@ def _add_actuators(mechanism: Mechanism, root: Element) -> None:
         bias = f"{_format(constant[k])} 0 0"
         force = {"gaintype": "fixed", "gainprm": "0", "biastype": "affine", "biasprm": bias}
         SubElement(actuators, "general", {"name": f"force on {name}", "joint": name} | force)
+    return notes
+
+
+def _is_chain(mechanism: Mechanism, coordinates: IntArray) -> bool:
+    """Whether the coordinates are of joints of one branch, each of which carries the next."""
+    model = mechanism.tree.model
+    last = int(model.getJointId(mechanism.coordinates[coordinates[-1]]))
+    return all(mechanism.tree.support[last, 0, k] for k in coordinates)
 
 
 def _tendon_section(root: Element) -> Element:

@@ -16,7 +16,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.formats.conversion import to_rpy
 from ckc_pin.formats.loop_frames import LoopJoint, loop_joint
 from ckc_pin.formats.urdf.elements import INERTIA_ENTRIES, format_numbers, parse_origin
-from ckc_pin.formats.urdf.writer import follower_of, list_omissions, list_visuals
+from ckc_pin.formats.urdf.writer import follower_of, largest_effort, list_omissions, list_visuals
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["to_sdf"]
@@ -151,11 +151,8 @@ def _add_tree_joint(mechanism: Mechanism, model: Element, element: Element, asse
     for tag, bound in (("lower", lower[k]), ("upper", upper[k])):
         if np.isfinite(bound):
             SubElement(limit, tag).text = repr(float(bound - assembled[k]))
-    effort = NO_EFFORT
-    for turns, largest in zip(mechanism.motors.transmission, mechanism.motors.torque_limit, strict=True):
-        if np.flatnonzero(turns).tolist() == [k]:
-            effort = float(abs(turns[k]) * np.max(largest)) if np.all(np.isfinite(largest)) else -1.0
-    SubElement(limit, "effort").text = repr(effort)
+    effort = largest_effort(mechanism, k)
+    SubElement(limit, "effort").text = repr(NO_EFFORT if effort is None else effort if np.isfinite(effort) else -1.0)
     dynamics = SubElement(axis, "dynamics")
     for tag, value in (
         ("damping", springs.joint_damping[k]),

@@ -16,7 +16,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.spec import CouplingSpec
 from ckc_pin.mechanism.urdf import parse
 
-__all__ = ["follower_of", "list_omissions", "list_visuals", "to_urdf"]
+__all__ = ["follower_of", "largest_effort", "list_omissions", "list_visuals", "to_urdf"]
 
 LOOP_TYPES = {"ball": "spherical"}  # others have the names of URDF joints
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
@@ -48,8 +48,13 @@ def to_urdf(mechanism: Mechanism) -> tuple[str, list[str]]:
                 copied.remove(old)
             if any(dynamics.values()):
                 SubElement(copied, "dynamics", {key: repr(float(value)) for key, value in dynamics.items()})
-            if element.get("type") == "revolute" and element.find("limit") is None:
+            limit = copied.find("limit")
+            if element.get("type") == "revolute" and limit is None:
                 copied.set("type", "continuous")
+            effort = largest_effort(mechanism, k)
+            if effort is not None and np.isfinite(effort):
+                limit = SubElement(copied, "limit", velocity="0") if limit is None else limit
+                limit.set("effort", repr(effort))
     elements = {element.attrib["name"]: element for element in root.findall("joint")}
     for coupling in mechanism.couplings:
         joint, other, ratio, offset = follower_of(mechanism, coupling, "a URDF")
@@ -67,6 +72,15 @@ def to_urdf(mechanism: Mechanism) -> tuple[str, list[str]]:
     notes = _add_transmissions(mechanism, root)
     indent(root)
     return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n", notes + list_omissions(mechanism)
+
+
+def largest_effort(mechanism: Mechanism, k: int) -> float | None:
+    """Return the largest force or torque of a motor on coordinate k alone, infinite without a limit; None: no motor."""
+    motors = mechanism.motors
+    for turns, limits in zip(motors.transmission, motors.torque_limit.T, strict=True):
+        if np.flatnonzero(turns).tolist() == [k]:
+            return float(np.abs(turns[k] * limits).max())
+    return None
 
 
 def follower_of(mechanism: Mechanism, coupling: CouplingSpec, program: str) -> tuple[str, str, float, float]:
@@ -108,12 +122,13 @@ def list_visuals(mechanism: Mechanism) -> dict[str, list[Element]]:
 def list_omissions(mechanism: Mechanism) -> list[str]:
     """Return notes on what neither a URDF nor an SDF has."""
     spec, joints, labels = mechanism.spec, mechanism.joints, np.array(mechanism.coordinates)
-    armature = mechanism.tree.model.armature
+    armature, motors = mechanism.tree.model.armature, mechanism.motors
     notes = []
     for what, present in (
         (f"rotor inertia of {', '.join(labels[armature > 0])}", bool(armature.any())),
         ("springs between frames", any(spring.frame_a is not None for spring in spec.spring)),
         ("constant forces", bool(spec.force)),
+        ("the smaller one of two torque limits", bool((motors.torque_limit[0] != -motors.torque_limit[1]).any())),
         (f"rebound of stops of {', '.join(labels[joints.restitution > 0])}", bool(joints.restitution.any())),
     ):
         notes += [f"left out: {what}"] if present else []

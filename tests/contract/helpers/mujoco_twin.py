@@ -118,8 +118,17 @@ class Twin:
                 residuals[f"{loop.name}, rotation"] = float(np.linalg.norm(pin.log3(a.rotation.T @ b.rotation)))
         named = dict(zip(self.tree.coordinates, self.tree.to_coordinates(q_tree), strict=True))
         for coupling, _ in self.draft.couplings:
-            residual = named[coupling.joint] - coupling.ratio * named[coupling.other] - coupling.offset
-            residuals[f"{coupling.joint} by {coupling.other}" if coupling.ratio else coupling.joint] = abs(residual)
+            if coupling.joints:
+                first = next(iter(coupling.joints.values()))
+                residual = sum(x * named[joint] for joint, x in coupling.joints.items()) - coupling.offset
+                name = coupling.name or next(iter(coupling.joints))
+                residuals[name] = abs(residual / first)
+            else:
+                powers = coupling.polynomial or [0.0, coupling.ratio]
+                residual = (
+                    named[coupling.joint] - coupling.offset - np.polynomial.Polynomial(powers)(named[coupling.other])
+                )
+                residuals[f"{coupling.joint} by {coupling.other}"] = abs(residual)
         return residuals
 
     def mujoco_residuals(self) -> dict[str, float]:
