@@ -170,6 +170,9 @@ def parse_xml(text: str, source: str) -> ElementTree.Element:
     parser.StartDoctypeDeclHandler = reject_doctype
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler = builder.data
+    stripped = text.lstrip("\ufeff \t\r\n")
+    if stripped.startswith("<?xml"):  # published files have empty lines above the declaration, which XML forbids
+        text = stripped
     try:
         parser.Parse(text.encode(), True)
     except expat.ExpatError as error:

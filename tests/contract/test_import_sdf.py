@@ -238,6 +238,33 @@ def test_link_with_two_parents_is_a_loop(tmp_path: Path) -> None:
     assert_close(mechanism.q_tree, np.zeros(3), 1e-12)  # the file's poses close the loop
 
 
+def test_attached_links_are_a_weld_as_they_are_drawn(tmp_path: Path) -> None:
+    """Gazebo's DetachableJoint attaches c's tip, a link of its own, to b: a four-bar whose bars b and c are one."""
+    tip = link("tip", "0.4 0 0.1 0 0 0") + joint("j4", "c", "tip")
+    plugin = """<plugin filename="gz-sim-detachable-joint-system" name="gz::sim::systems::DetachableJoint">
+    <parent_link>b</parent_link><child_model>m</child_model><child_link>tip</child_link></plugin>"""
+    draft = imported(tmp_path, model(FOUR_BAR + tip + plugin))
+    mechanism = draft.build_mechanism()
+    assert (mechanism.n, mechanism.rank, mechanism.d) == (4, 3, 1)
+    assert_close(mechanism.q_tree, np.zeros(4), 1e-12)
+    with pytest.raises(InputError, match="there is no frame 'nothing'"):
+        imported(tmp_path, model(FOUR_BAR + tip + plugin.replace("tip</child_link>", "nothing</child_link>")))
+
+
+def test_a_link_and_a_joint_of_one_name_are_both_read(tmp_path: Path) -> None:
+    """Old files have such names. Others that refer to the name mean the link."""
+    content = link("a") + link("pin", "0 0 0.3 0 0 0") + joint("j1", "world", "a") + joint("pin", "a", "pin")
+    draft = imported(tmp_path, model(content + link("b", "0 0 0.5 0 0 0") + joint("j2", "pin", "b")))
+    assert draft.build_mechanism().coordinates == ("j1", "pin", "j2")
+
+
+def test_empty_lines_above_the_declaration_are_ignored(tmp_path: Path) -> None:
+    content = link("a") + joint("j1", "world", "a")
+    text = model(content)
+    assert text.startswith("<?xml")
+    assert imported(tmp_path, "\n\n" + text).build_mechanism().d == 1
+
+
 def test_properties_of_an_axis_are_read(tmp_path: Path) -> None:
     limit = "<limit><lower>-1e16</lower><upper>0.7</upper><effort>-1</effort></limit>"
     dynamics = (

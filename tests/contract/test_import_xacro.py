@@ -36,6 +36,12 @@ def test_macros_arguments_and_packages_are_expanded(tmp_path: Path) -> None:
     assert places == {"left_hip": "-1.0 0.0 0.0", "right_hip": "-0.5 0.0 0.0"}
 
 
+def test_properties_may_begin_with_an_underscore(tmp_path: Path) -> None:
+    text = ROBOT.replace('<link name="base"/>', '<xacro:property name="_long" value="0.25"/><link name="base"/>')
+    draft = expanded(tmp_path, text.replace("$(arg size)", "${2 * _long}"))
+    assert draft.robot.find("joint[@name='right_hip']/origin").get("xyz") == "-0.5 0.0 0.0"
+
+
 def test_xacro_may_expand_to_another_format(tmp_path: Path) -> None:
     text = f'<sdf version="1.9" {XMLNS}><model name="m"><link name="a"/></model></sdf>'
     assert expanded(tmp_path, text, "thing.sdf.xacro").origin == "thing.sdf.xacro, an SDFormat file, expanded by xacro"

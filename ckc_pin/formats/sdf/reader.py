@@ -186,15 +186,18 @@ class _Reader:
             self.static += [link for link in self.links if link.startswith(f"{name}::")]
         for joint in element.findall("joint"):
             child = (joint.findtext("child") or "").strip()
-            joint_name, where_joint = join(name, joint.get("name", "")), f"{self.path}: joint {joint.get('name')!r}"
+            joint_name, where_joint = self._joint_frame(name, joint), f"{self.path}: joint {joint.get('name')!r}"
             pose = joint.find("pose")
             relative_to = self._target(pose, child)
             self.frames.add(joint_name, where_joint, relative_to, parse_pose(pose, where_joint), child)
             self.pending.append(_Pending(joint, name, version))
         self.pending += [_Pending(e, name, version) for e in element.findall("drake:ball_constraint")]
         for plugin in element.findall("plugin"):
-            if any(kind in plugin.get("name", "") + plugin.get("filename", "") for kind in MOTOR_PLUGINS):
+            kinds = plugin.get("name", "") + plugin.get("filename", "")
+            if any(kind in kinds for kind in MOTOR_PLUGINS):
                 self.actuated += [(name, (e.text or "").strip()) for e in plugin.findall("joint_name")]
+            elif "DetachableJoint" in kinds:
+                self.pending.append(_Pending(plugin, name, version))
             else:
                 self.unread["<plugin> of <model>"] += 1
 
@@ -239,6 +242,9 @@ class _Reader:
             if element.tag == "drake:ball_constraint":
                 self._add_ball_constraint(robot, element, scope)
                 continue
+            if element.tag == "plugin":
+                self._add_detachable_joint(robot, element, scope)
+                continue
             self._count_unread(element)
             if element.get("type") == "gearbox":
                 gearboxes.append(pending)
@@ -269,7 +275,7 @@ class _Reader:
             choices = ", ".join((*JOINT_KINDS, "gearbox"))
             raise MechanismError(f"{where}: unsupported type {kind!r}; expected one of {choices}")
         parent, child = self._ends(element, scope, where)
-        full_name = join(scope, name)
+        full_name = self._joint_frame(scope, element)
         if full_name not in self.frames.frames:  # a joint of the world
             pose = element.find("pose")
             target = self.frames.find(self._target(pose, child), scope, where)
@@ -282,8 +288,15 @@ class _Reader:
 
         poses = [self.frames.pose(link).inverse() * pose for link in links]
         axes = read_axes(element, kind, rotate, where)
-        joint = Joint.between(self._short(full_name), JOINT_KINDS[kind], [*map(self._short, links)], poses, axes)
+        joint = Joint.between(
+            self._short(join(scope, name)), JOINT_KINDS[kind], [*map(self._short, links)], poses, axes
+        )
         return replace(joint, pitch=read_pitch(element, where) if kind == "screw" else 0.0)
+
+    def _joint_frame(self, scope: str, joint: Element) -> str:
+        """Return the name of a joint's frame. Old files give a link and a joint one name, which then means the link."""
+        name = join(scope, joint.get("name", ""))
+        return f"{name} (joint)" if name in self.links else name
 
     def _axes_of(self, axis: Element, scope: str, joint: str, version: tuple[int, ...], where: str) -> Array:
         """Return the world's rotation of the frame in which an axis is written."""
@@ -322,6 +335,22 @@ class _Reader:
         links = [self._short(end) for end in ends]
         name = make_unique("_".join(links), robot.joints)
         robot.add_joint(replace(Joint.between(name, "ball", links, poses, ball_axes()), closes=True))
+
+    def _add_detachable_joint(self, robot: Robot, element: Element, scope: str) -> None:
+        """Add a weld of two links as they are drawn, as Gazebo's plugin attaches them."""
+        where = f"{self.path}: plugin DetachableJoint"
+        model, ends = (element.findtext("child_model") or "").strip(), []
+        for tag, prefix in (
+            ("parent_link", ""),
+            ("child_link", "" if model in ("", scope.rpartition("::")[2]) else model),
+        ):
+            name = join(prefix, (element.findtext(tag) or "").strip())
+            ends.append(self.frames.link_of(self.frames.find(name, scope, f"{where}, <{tag}>"), where))
+        poses = [self.frames.pose(end) for end in ends]
+        links = [self._short(end) for end in ends]
+        in_parent = [poses[0].inverse() * poses[1], pin.SE3.Identity()]
+        name = make_unique("_".join(links), robot.joints)
+        robot.add_joint(replace(Joint.between(name, "fixed", links, in_parent, []), closes=True))
 
     def _add_gearbox(self, robot: Robot, pending: _Pending, where: str) -> None:
         """Add angle of the child = -ratio * angle of the parent, both relative to the reference body."""

@@ -1,7 +1,8 @@
 """Expand xacro files with the package `xacro`, which needs no ROS.
 
-xacro evaluates Python expressions. Those of an untrusted file could reach Python's internals through attributes. Names
-and attributes that begin with an underscore, and those of frames and generators, are therefore refused.
+xacro evaluates Python expressions. Those of an untrusted file could reach Python's internals through attributes.
+Attributes that begin with an underscore, names that begin with two, and those of frames and generators, are therefore
+refused.
 `$(find PACKAGE)` is a folder of the file's repository.
 """
 
@@ -43,7 +44,8 @@ def expand_xacro(path: Path) -> str:
     def check_and_evaluate(expression: str, *scopes: Any) -> Any:
         for node in ast.walk(ast.parse(expression.strip(), mode="eval")):
             name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
-            if INTERNAL.match(name):
+            is_property = isinstance(node, ast.Name) and re.match(r"_(?!_)", name)
+            if INTERNAL.match(name) and not is_property:
                 raise InputError(f"{path}: the expression ${{{expression}}} uses {name!r}, which is not accepted")
         return evaluate(expression, *scopes)
 
