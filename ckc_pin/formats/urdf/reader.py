@@ -45,14 +45,7 @@ READ = {  # other elements are left out with a note
 
 
 def read_urdf(text: str, path: Path) -> Robot:
-    """Read a URDF and its loops.
-
-    Parameters
-    ----------
-    text : str
-    path : Path
-        File of the text. A robot.yaml or loop_closures.yaml in the same folder belongs to it.
-    """
+    """Read a URDF and its loops. A robot.yaml or loop_closures.yaml in the same folder belongs to it."""
     root, source = parse_xml(text, str(path)), str(path)
     robot = Robot(name=choose_name(path, root.get("name", "")), origin=f"{path.name}, a URDF", source=source)
     robot.materials = root.findall("material")
