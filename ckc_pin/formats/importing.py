@@ -78,6 +78,8 @@ def read_robot(path: Path) -> Robot:
             )
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
+    if path.suffix.startswith(".usd"):
+        raise InputError(f"{path}: USD is not supported; export the robot as MJCF, SDFormat or URDF and import that")
     text = read_text(path, "robot file")
     expanded = is_xacro(path, text)
     if expanded:

@@ -48,15 +48,7 @@ def propose_loop_types(draft: Draft) -> None:
 
 
 def _propose_types(draft: Draft, untyped: Sequence[LoopSpec]) -> list[Proposal]:
-    """Propose a type for each loop, with the reason.
-
-    Parameters
-    ----------
-    draft : Draft
-        With the tree, and the loops whose types the file specifies.
-    untyped : sequence of LoopSpec
-        Of type point.
-    """
+    """Propose a type for each loop of type point, with the reason."""
     tree, frames, urdf = draft.build_tree()
     proposals: dict[str, Proposal] = {}
     for loop in untyped:

@@ -150,10 +150,7 @@ class _Tree:
         self.guessed += [f"joints that {what}: {list_names(names)}" for what, names in reported.items()]
 
     def _loop(self, joint: Joint) -> LoopSpec:
-        ends = [
-            make_frame(link, self.offset[link] * pose)
-            for link, pose in ((joint.parent, joint.in_parent), (joint.child, joint.in_child))
-        ]
+        ends = [self._at(link, pose) for link, pose in ((joint.parent, joint.in_parent), (joint.child, joint.in_child))]
         name = make_unique(joint.name, [spec.name for spec, _ in [*self.robot.loops, *self.loops]])
         axes = [round_vector(axis.direction) for axis in joint.axes if joint.kind != "ball"]
         directions: dict[str, Any] = {"axis_a": axes[0], "axis_b": axes[-1]} if axes else {}
@@ -227,8 +224,20 @@ class _Tree:
                 name = f"joint:{placed.coordinates[-1] if placed.axes else placed.name}"
                 return name if isinstance(frame, str) else FrameSpec(link=name, xyz=frame.xyz, rpy=frame.rpy)
             link, pose = declared.child, declared.in_child * pose
-        elif link == "world" or self.offset.get(link, pose).isIdentity(0.0):
+        elif link not in self.offset or (self.offset[link].isIdentity(0.0) and not self._hides_ground(link)):
             return frame
+        return self._at(link, pose)
+
+    def _hides_ground(self, link: str) -> bool:
+        """Whether a moving link has the name of the ground."""
+        return link == "world" and self.robot.find_base() != link
+
+    def _at(self, link: str, pose: pin.SE3) -> Frame:
+        """Return a frame of the URDF at a pose in a link of the robot."""
+        if self._hides_ground(link):
+            raise MechanismError(
+                f"{self.robot.source}: link 'world' is carried by a joint; rename it, since loops use it"
+            )
         return make_frame(link, self.offset[link] * pose)
 
 

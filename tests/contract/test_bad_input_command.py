@@ -60,7 +60,12 @@ CASES = [
         ["own.scene.toml: it contains no scene, "],
         files={"own.scene.toml/x": ""},
     ),
-    Bad("URDF as scene", ["run", "bar/five_bar.urdf"], ["malformed TOML", "line 1", "named in a mechanism.toml"]),
+    Bad(
+        "URDF as scene",
+        ["run", "bar/odd.toml"],
+        ["malformed TOML", "line 1", "named in a mechanism.toml"],
+        files={"bar/odd.toml": '<robot name="r"><link name="a"/></robot>'},
+    ),
     Bad("scene as mechanism", [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"], ["unknown key 'mechanism'"]),
     Bad("a name that no file can have", ["check", "\0.toml"], [r"'\x00.toml'", "not a valid file name"]),
     Bad("a name too long for a file", ["check", "x" * 5000 + ".toml"], ["xx.toml: cannot be read: File name too"]),

@@ -151,6 +151,7 @@ GEAR = '<coupling name="g"><predecessor link="{}"/><successor link="base"/>{}</c
 CASES = [
     Bad("no file", ["import", "nowhere.xml"], ["nowhere.xml: no such robot file"]),
     Bad("a folder", ["import", "d"], ["d: a folder"], files={"d/x": ""}),
+    Bad("a USD stage", ["import", "r.usda"], ["USD is not supported"], files={"r.usda": "#usda 1.0"}),
     Bad("not XML", X, ["m.xml: malformed XML"], files={"m.xml": "solid"}),
     Bad("not text", X, ["m.xml", "not UTF-8"], files={"m.xml": b"\xff\xfe\x00"}),
     Bad("an entity bomb", X, ["document type declaration (x) is not accepted"], files={"m.xml": BOMB}),

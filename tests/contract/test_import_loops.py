@@ -145,6 +145,8 @@ def test_elements_that_are_not_read_are_named_with_their_count(tmp_path: Path) -
         *("3 <collision> of <link>", "3 <calibration> of <joint>"),
     }
     assert has_note(draft.warnings, "1 <closure>", "up to 6 freedoms more")
+    plain = imported(tmp_path, LINKS + JOINTS + "<sensor/>")
+    assert has_note(plain.guessed, "no loops, because no element that was read declares one")
     assert not has_note(draft.guessed, "declares none")
 
 
@@ -235,6 +237,10 @@ def test_second_parent_is_cut_into_a_loop(tmp_path: Path) -> None:
         (GAZEBO.format("").replace("<parent>c", "<parent>x"), "parent 'x' is not a link"),
         (GAZEBO.format("").replace("<xyz>0 0 1", "<xyz>0 0 0"), "<axis>: expected a direction"),
         (joint("j1", "w", "c", 0.0), "two <joint> elements are called 'j1'"),
+        (
+            joint("ground", "b", "world", 0.0) + DIALECTS["loop"][0].replace('link="b"', 'link="world"'),
+            "link 'world' is carried by a joint; rename it",
+        ),
         ('<link name="lost"/>', "links are not connected; roots found: 'w', 'lost'"),
     ],
 )  # fmt: skip

@@ -93,12 +93,7 @@ class Compiled:
     def _remove_unneeded_meshes(self, spec: Any, document: Document) -> tuple[dict[str, bytes], list[Any]]:
         """Remove meshes without influence on masses, and meshes whose files are missing.
 
-        Returns
-        -------
-        assets : dict of str to bytes
-            Content of the other meshes' files by token.
-        missing : list of (MjsBody, list of str, bool)
-            Bodies with missing meshes, the names of these, and whether the body has no mass without them.
+        Returns the other files' content by token, and the bodies with missing meshes: (body, meshes, has no mass).
         """
         files = {mesh.name: mesh.file for mesh in spec.meshes}
         assets: dict[str, bytes] = {}

@@ -122,15 +122,7 @@ def _read_visual(element: Element, where: str) -> Element | None:
 def read_axes(element: Element, kind: str, rotate: Callable[[Element, Array], Array], where: str) -> list[JointAxis]:
     """Return the axes of a joint in its frame.
 
-    Parameters
-    ----------
-    element : Element
-        The <joint>.
-    kind : str
-        SDFormat's type of the joint.
-    rotate : callable
-        Gets an <axis> and its direction as it is written, and returns the direction in the joint's frame.
-    where : str
+    `rotate` gets an <axis> and its direction as it is written, and returns the direction in the joint's frame.
     """
     if kind in ("fixed", "ball"):
         return [] if kind == "fixed" else ball_axes()

@@ -26,7 +26,7 @@ __all__ = ["find_urdf_beside", "read_urdf"]
 
 ROBOT_YAML = "robot.yaml"
 NO_LOOPS = (
-    "no loops, because the URDF declares none. To close one, write a table [[loop]] with name, type, frame_a and "
+    "no loops, because {}. To close one, write a table [[loop]] with name, type, frame_a and "
     "frame_b, such as the one at the end of mechanism.toml. Import itself recognizes <loop>, <loop_joint>, "
     "<constraint>, <drake:ball_constraint> and <gazebo><joint> in a URDF, closed_loop in a robot.yaml beside it "
     "(example-parallel-robots), a loop_closures.yaml, and pairs of links closing_NAME_1, closing_NAME_2 "
@@ -39,20 +39,13 @@ KINDS: dict[str, JointKind] = {
 }
 READ = {  # other elements are left out with a note
     "robot": {"link", "joint", "drake:joint", "material", "gazebo", "coupling", *LOOP_TAGS, *MOTOR_TAGS},
-    "link": {"inertial", "visual", "origin"},
+    "link": {"inertial", "visual"},
     "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "drake:screw_thread_pitch"},
 }
 
 
 def read_urdf(text: str, path: Path) -> Robot:
-    """Read a URDF and its loops.
-
-    Parameters
-    ----------
-    text : str
-    path : Path
-        File of the text. A robot.yaml or loop_closures.yaml in the same folder belongs to it.
-    """
+    """Read a URDF and its loops. A robot.yaml or loop_closures.yaml in the same folder belongs to it."""
     root, source = parse_xml(text, str(path)), str(path)
     robot = Robot(name=choose_name(path, root.get("name", "")), origin=f"{path.name}, a URDF", source=source)
     robot.materials = root.findall("material")
@@ -89,7 +82,11 @@ def read_urdf(text: str, path: Path) -> Robot:
     robot.guessed.append("gravity is along -z, because a URDF does not specify it")
     has_loops = robot.loops or robot.untyped or len(robot.joints) >= len(robot.links)
     if not has_loops and not robot.warnings:
-        robot.guessed.append(NO_LOOPS)
+        skipped = any(not what.endswith(("<link>", "<joint>")) for what in unread)
+        why = (
+            "no element that was read declares one; others are under left out" if skipped else "the URDF declares none"
+        )
+        robot.guessed.append(NO_LOOPS.format(why))
     meshes = [
         mesh.get("filename", "") for link in robot.links.values() for v in link.visuals for mesh in v.iter("mesh")
     ]

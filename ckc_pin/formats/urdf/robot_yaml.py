@@ -32,15 +32,7 @@ class RobotYaml(msgspec.Struct, frozen=True):
 
 
 def add_robot_yaml(robot: Robot, text: str, source: str) -> None:
-    """Add the loops and motors of a robot.yaml, and replace joints.
-
-    Parameters
-    ----------
-    robot : Robot
-    text : str
-    source : str
-        Name of the file in messages.
-    """
+    """Add the loops and motors of a robot.yaml, and replace joints."""
     content, unknown_keys = parse_yaml(text, RobotYaml, source)
     robot.left_out += [f"{source}: unsupported key {key!r}" for key in unknown_keys]
     if len(content.joint_name) != len(content.joint_type):
