@@ -157,7 +157,11 @@ def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism
         unchanged = build(sources.texts[MECHANISM_FILE], Sources(sources.name, sources.folder, sources.texts))
     except (InputError, MechanismError):  # the files' numbers may not assemble
         return mechanism
-    return unchanged if _key(unchanged, subject.which, subject.directional_derivatives) == subject.key else mechanism
+    is_covered = all(
+        np.all(subject.which[name] | ~there) for name, there in present(model_numbers(unchanged)).items()
+    )  # a number that an override sets to zero is no argument
+    same = is_covered and _key(unchanged, subject.which, subject.directional_derivatives) == subject.key
+    return unchanged if same else mechanism
 
 
 def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_derivatives: bool) -> str:

@@ -191,3 +191,13 @@ def test_compiled_terms_are_of_the_curve() -> None:
 
     paths = [compile_terms(make(c, offset)).path for c, offset in ((0.5, 0.1), (0.5, 0.2), (0.6, 0.1))]
     assert paths[0] == paths[1] != paths[2]
+
+
+def test_compiled_terms_of_a_number_that_an_override_sets_to_zero() -> None:
+    """An armature and the rotor of a motor on two joints, which the files give."""
+    motor = {"name": "m", "joints": {"a": 1.0, "b": -1.0}, "rotor_inertia": 0.01}
+    mechanism = wheels("a", "b", joints=[{"name": "a", "armature": 0.1}], motors=[motor])
+    scene = Scene(mechanism, formulation="dae", initial={"q": {"a": 0.6, "b": -0.3}}, t_end=0.2)
+    overrides = {**TIGHT, "joint.a.armature": 0.0, "motor.m.rotor_inertia": 0.0}
+    run, reference = (simulate(scene, {**overrides, "solver.terms": x}) for x in ("generated", "pinocchio"))
+    assert np.abs(run.q_tree - reference.q_tree).max() < 1e-9
