@@ -115,10 +115,17 @@ def test_couplings_of_generalized_rbda_are_imported(tmp_path: Path) -> None:
     content += '<coupling name="gear"><predecessor link="thigh"/><successor link="rotor"/><ratio value="6"/></coupling>'
     content += '<coupling name="belt"><predecessor link="shank"/><successor link="motor"/><ratio value="2"/></coupling>'
     draft = imported(tmp_path, content)
-    ((coupling, _),) = draft.couplings
-    assert (coupling.joint, coupling.other, coupling.ratio, coupling.offset) == ("spin", "hip", 6.0, 0.0)
-    assert has_note(draft.left_out, "coupling belt of more than two joints", "drive = 2 (knee + hip)")
-    assert draft.build_mechanism().d == 3
+    gear, belt = (coupling for coupling, _ in draft.couplings)
+    assert (gear.joint, gear.other, gear.ratio, gear.offset) == ("spin", "hip", 6.0, 0.0)
+    assert (belt.name, belt.joints, belt.offset) == ("belt", {"drive": 1.0, "knee": -2.0, "hip": -2.0}, 0.0)
+    assert draft.build_mechanism().d == 2
+
+
+def test_trees_beside_the_world_are_free(tmp_path: Path) -> None:
+    content = "".join(link(name) for name in ("world", "arm", "body", "leg"))
+    draft = imported(tmp_path, content + joint("turn", "world", "arm") + joint("hip", "body", "leg"))
+    assert has_note(draft.guessed, "body is free", "root.x to root.rz")
+    assert draft.build_mechanism().d == 8
 
 
 # --- pairs of frames ------------------------------------------------------------------------------------------------

@@ -140,12 +140,14 @@ def _add_coupling(element: Element, robot: Robot, where: str) -> None:
     except ValueError:
         raise InputError(f"{where}: expected <ratio> with a number as value") from None
     before, after = ([joint for joint in chain if joint not in other] for chain, other in (chains, chains[::-1]))
+    name = element.get("name", "")
     if len(before) == 1 and len(after) == 1:
-        spec = CouplingSpec(joint=after[0], other=before[0], ratio=round_number(ratio))
-        robot.couplings.append((spec, element.get("name", "")))
-        return
-    equation = f"{' + '.join(after) or '0'} = {ratio:g} ({' + '.join(before) or '0'})"
-    robot.left_out.append(f"coupling {element.get('name', '')} of more than two joints: {equation}")
+        robot.couplings.append((CouplingSpec(joint=after[0], other=before[0], ratio=round_number(ratio)), name))
+    elif before or after:
+        joints = dict.fromkeys(after, 1.0) | dict.fromkeys(before, -round_number(ratio))
+        robot.couplings.append((CouplingSpec(name=name or None, joints=joints), ""))
+    else:
+        robot.left_out.append(f"coupling {name}: no joint lies between its links")
 
 
 def _moving_joints_above(link: str, robot: Robot) -> Iterator[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from ckc_pin.base.sources import parse_xml
 from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.conversion import choose_name, list_names, require_direction
+from ckc_pin.formats.conversion import choose_name, list_names, make_unique, require_direction
 from ckc_pin.formats.robot import UNLIMITED, Body, Joint, JointAxis, JointKind, JointLimits, Link, Robot, ball_axes
 from ckc_pin.formats.urdf.closing_frames import find_closing_frames
 from ckc_pin.formats.urdf.elements import INERTIA_ENTRIES, parse_origin
@@ -70,6 +70,7 @@ def read_urdf(text: str, path: Path) -> Robot:
         find_closing_frames(robot)
         if robot.loops or robot.untyped:
             robot.origin = f"{path.name}, a URDF with pairs of closing frames as from onshape-to-robot"
+    _free_other_roots(robot)
     _set_independent(robot, root)
     add_control_mimics(robot, root)
     _check_mimics(robot)
@@ -119,6 +120,20 @@ def _read_link(element: Element, where: str, unread: Counter[str]) -> Link:
             inertia[row, column] = inertia[column, row] = floats(tensor, key, 1, None, f"{where}, <inertia>")[0]
         link.body = Body(mass, inertia=inertia).transformed(parse_origin(inertial, f"{where}, <inertial>"))
     return link
+
+
+def _free_other_roots(robot: Robot) -> None:
+    """Let trees beside the world move freely, as Drake does."""
+    carried = {joint.child for joint in robot.joints.values() if not joint.closes}
+    if "world" not in robot.links or "world" in carried:
+        return
+    parents = {joint.parent for joint in robot.joints.values()}
+    for link in [name for name in robot.links if name not in carried and name in parents - {"world"}]:
+        name = make_unique("root", robot.joints)
+        robot.add_joint(Joint(name, "floating", "world", link))
+        robot.guessed.append(
+            f"{link} is free, with the coordinates {name}.x to {name}.rz, because no joint connects it to the world"
+        )
 
 
 def _require(element: Element, tag: str, where: str) -> Element:
