@@ -85,9 +85,11 @@ class Linkage:
             builder.add_loop(loop)
         mimic = [CouplingSpec(joint=a, other=b, ratio=r, offset=c) for a, b, r, c in urdf.mimic]
         self.couplings = (*spec.coupling, *mimic)
-        names = [coupling.name for coupling in self.couplings if coupling.name is not None]
-        if len(set(names)) < len(names):
-            raise MechanismError(f"coupling: two couplings have the same name, of {', '.join(names)}")
+        names = [loop.name for loop in spec.loop]
+        names += [coupling.name for coupling in self.couplings if coupling.name is not None]
+        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if twice is not None:
+            raise MechanismError(f"coupling: two couplings, or a coupling and a loop, have the same name {twice!r}")
         for coupling in self.couplings:
             builder.add_coupling(coupling)
         for joint, value in (prescribed or {}).items():

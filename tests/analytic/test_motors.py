@@ -116,7 +116,7 @@ rotor_inertia = 1e-3
 def test_shared_rotor_makes_the_motion_of_the_extended_equation(formulation: str, terms: str, mass: float) -> None:
     """Two wheels with a rotor between them: (diag(I) + J w w^T) a = gravity's torques, integrated by SciPy.
 
-    With a mass of 1e7 kg the DAE uses mass levels.
+    With a mass of 1e7 kg the DAE compares its rounding with that of mass levels.
     """
     wheel = """<link name="{0}w"><inertial><origin xyz="{1} 0 0"/><mass value="{2}"/>
       <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>

@@ -116,9 +116,8 @@ LOOPS = [
     _add("a table of two points", _coupling("table = [[0, 0], [2, 1]]"), "expected 3 to 500 points, got 2"),
     _add("a table that is no table", _coupling("table = [[0, 0, 1]]"), "expected a list of 2, got a list of 3"),
     _add("a polynomial of infinities", _coupling("polynomial = [0.0, inf]"), FINITE),
-    _add(
-        "couplings of one name", 2 * (_coupling('name = "g"\nratio = 1.0') + "\n"), "two couplings have the same name"
-    ),
+    _add("couplings of one name", 2 * (_coupling('name = "g"\nratio = 1.0') + "\n"), "have the same name 'g'"),
+    _add("a coupling named as a loop", _coupling('name = "elbow"\nratio = 1.0'), "have the same name 'elbow'"),
     _add("spring on nothing", "[[spring]]\nstiffness = 1.0", "spring 1: give either joint, or frame_a and frame_b"),
     _add("spring on an unknown joint", '[[spring]]\njoint = "x"\nstiffness = 1.0', "'x'", COORDINATES),
     _add(
