@@ -81,6 +81,8 @@ def read_robot(path: Path) -> Robot:
     if path.suffix.startswith(".usd"):
         raise InputError(f"{path}: USD is not supported; export the robot as MJCF, SDFormat or URDF and import that")
     text = read_text(path, "robot file")
+    if "<%" in text:
+        raise InputError(f"{path}: a template of ERB (<% ... %>); expand it first, and import the result")
     expanded = is_xacro(path, text)
     if expanded:
         text = expand_xacro(path)

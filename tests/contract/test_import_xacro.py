@@ -74,6 +74,15 @@ def test_missing_package_macro_and_file_are_named(tmp_path: Path) -> None:
             expanded(tmp_path, ROBOT.replace(old, new))
 
 
+def test_missing_arguments_are_named_with_the_way_out(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"a template of ERB"):
+        expanded(tmp_path, ROBOT.replace("0.5", "<%= size %>"))
+    with pytest.raises(
+        InputError, match=r"argument size.*; it has no default, .* `xacro walker.urdf.xacro ARGUMENT:=VALUE"
+    ):
+        expanded(tmp_path, ROBOT.replace('<xacro:arg name="size" default="0.5"/>', ""))
+
+
 def test_missing_xacro_is_named_with_the_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(InputError, match=r"pip install 'ckc_pin\[xacro\]'.*xacro FILE > robot.urdf"):

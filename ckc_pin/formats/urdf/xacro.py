@@ -63,7 +63,13 @@ def expand_xacro(path: Path) -> str:
     except InputError:
         raise
     except Exception as error:  # xacro raises errors of any class for a malformed file
+        if isinstance(refused := getattr(error, "exc", None), InputError):
+            raise refused from None
         reason = " ".join(str(error).split()) or type(error).__name__
+        if "Undefined substitution argument" in reason:
+            reason += (
+                f"; it has no default, so expand the file first with `xacro {path.name} ARGUMENT:=VALUE > robot.urdf`"
+            )
         raise InputError(f"{path}: xacro cannot expand it: {reason}") from None
     finally:
         for (module, name), function in originals.items():
