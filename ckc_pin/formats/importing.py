@@ -1,6 +1,6 @@
 """Read a file of another program's format, and write it as ``mechanism.toml`` with a URDF.
 
-Supported: MuJoCo's MJCF, SDFormat, and URDFs whose loops are declared in one of several dialects, by a file beside
+Supported: MuJoCo's MJCF, SDFormat, USD, and URDFs whose loops are declared in one of several dialects, by a file beside
 them, by pairs of closing frames, or not at all.
 """
 
@@ -29,6 +29,7 @@ from ckc_pin.formats.tree import make_draft
 from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML
 from ckc_pin.formats.urdf.reader import ROBOT_YAML, find_urdf_beside, read_urdf
 from ckc_pin.formats.urdf.xacro import expand_xacro, is_xacro
+from ckc_pin.formats.usd.reader import USD_SUFFIXES, read_usd
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.scene.names import DEFAULT, SUFFIX
@@ -46,7 +47,7 @@ def read(path: Path, repair: bool = False) -> Draft:
     Parameters
     ----------
     path : Path
-        A MuJoCo model, an SDFormat file, a URDF, or a robot.yaml or loop_closures.yaml beside its URDF.
+        A MuJoCo model, an SDFormat file, a USD stage, a URDF, or a robot.yaml or loop_closures.yaml beside its URDF.
     repair : bool
         Whether impossible inertias and swapped limits are replaced by possible ones, instead of being refused.
 
@@ -78,8 +79,8 @@ def read_robot(path: Path) -> Robot:
             )
         read_text(path, "YAML file")
         path = find_urdf_beside(path)
-    if path.suffix.startswith(".usd"):
-        raise InputError(f"{path}: USD is not supported; export the robot as MJCF, SDFormat or URDF and import that")
+    if path.suffix.lower() in USD_SUFFIXES:
+        return read_usd(path)
     text = read_text(path, "robot file")
     if "<%" in text:
         raise InputError(f"{path}: a template of ERB (<% ... %>); expand it first, and import the result")

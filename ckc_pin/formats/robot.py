@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import MechanismError
+from ckc_pin.formats.conversion import make_unique, round_number
 from ckc_pin.mechanism.spec import CouplingSpec, ForceSpec, LoopSpec, MotorSpec, PointSpec, SpringSpec, Vector3
 
 __all__ = [
@@ -199,6 +200,18 @@ class Robot(Tables):
         if joint.parent == joint.child:
             raise MechanismError(f"{where}: it connects link {joint.child!r} with itself; expected two links")
         self.joints[joint.name] = joint
+
+    def add_free_root(self, link: str, pose: pin.SE3) -> None:
+        """Connect a link with the world by a free joint. Its pose is where the assembly starts."""
+        name = make_unique("root", self.joints)
+        self.add_joint(Joint(name, "floating", "world", link))
+        values = (*pose.translation, *pin.log3(pose.rotation))
+        labels = ("x", "y", "z", "rx", "ry", "rz")
+        guess = {f"{name}.{label}": round_number(float(x)) for label, x in zip(labels, values, strict=True)}
+        self.q_guess |= {label: x for label, x in guess.items() if x}
+        self.guessed.append(
+            f"{link} is free, with the coordinates {name}.x to {name}.rz, because no joint fixes it to the world"
+        )
 
     def leave_out(self, unread: Counter[str]) -> None:
         """Note elements that were not read; those that seem to close loops are warnings."""

@@ -167,6 +167,8 @@ class _Tree:
         tables = {field.name: copy(getattr(robot, field.name)) for field in fields(Tables)}
         draft = Draft(**tables, robot=xml)
         draft.guessed += self.guessed
+        cut = {name for joint in robot.joints.values() if joint.name not in self.joints for name in joint.coordinates}
+        draft.q_guess = {name: x for name, x in robot.q_guess.items() if name not in cut}
         draft.springs = []
         for joint in self.joints.values():
             self._add_joint(draft, joint)

@@ -91,6 +91,8 @@ class Motors:
     def driven_coordinates(self) -> IntArray:
         """Return the coordinates that a motor drives, in the order of the motors."""
         driven = np.flatnonzero(self.transmission.any(axis=0))
+        if not len(driven):  # argmax needs a motor
+            return driven
         return driven[np.argsort(np.argmax(self.transmission[:, driven] != 0, axis=0), kind="stable")]
 
     def force(self, tau: Array) -> Array:

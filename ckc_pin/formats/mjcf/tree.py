@@ -27,13 +27,13 @@ from ckc_pin.formats.conversion import (
 )
 from ckc_pin.formats.mjcf.compiled import Compiled
 from ckc_pin.formats.robot import UNLIMITED, Body, Joint, JointAxis, JointKind, JointLimits, Link, ball_axes
-from ckc_pin.formats.urdf.elements import format_numbers, make_visual
+from ckc_pin.formats.urdf.elements import make_visuals
 
 __all__ = ["MjcfTree", "Placed"]
 
 ASSEMBLED_KEY = "assembled"  # name of the key frame that `ckc export` writes
 JOINT_KINDS = ("free", "ball", "slide", "hinge")  # by mjtJoint
-SPHERE, CAPSULE, CYLINDER, BOX = 2, 3, 5, 6  # mjtGeom
+SHAPES = {2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}  # by mjtGeom
 ORTHOGONAL_TOLERANCE = 1e-12  # between the axes of three slides
 FREE_LABELS = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -316,15 +316,8 @@ def _pose(quaternions: Array, positions: Array, number: int) -> pin.SE3:
 
 def _draw_shape(model: Any, geom: int, link: Link, pose: pin.SE3) -> bool:
     """Add a shape to a link; return False if URDF has no such shape."""
-    kind = int(model.geom_type[geom])
-    radius, half, _ = (float(x) for x in model.geom_size[geom])
-    if kind == SPHERE:
-        link.visuals.append(make_visual(pose, "sphere", radius=repr(radius)))
-    elif kind == BOX:
-        link.visuals.append(make_visual(pose, "box", size=format_numbers(2 * model.geom_size[geom])))
-    elif kind in (CYLINDER, CAPSULE):
-        link.visuals.append(make_visual(pose, "cylinder", radius=repr(radius), length=repr(2 * half)))
-        for z in (-half, half) if kind == CAPSULE else ():
-            end = pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, z]))
-            link.visuals.append(make_visual(end, "sphere", radius=repr(radius)))
-    return kind in (SPHERE, BOX, CYLINDER, CAPSULE)
+    shape = SHAPES.get(int(model.geom_type[geom]))
+    if shape:
+        size = 2 * model.geom_size[geom]
+        link.visuals += make_visuals(pose, shape, size, float(size[0]) / 2, float(size[1]))
+    return shape is not None

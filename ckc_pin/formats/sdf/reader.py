@@ -403,16 +403,8 @@ class _Reader:
         pose = self.frames.pose(full)
         if kind == "fixed":
             robot.add_joint(Joint(make_unique(f"{link}_fixed", robot.joints), "fixed", WORLD, link, pose))
-            return
-        name = make_unique("root", robot.joints)
-        robot.add_joint(Joint(name, "floating", WORLD, link))
-        values = (*pose.translation, *pin.log3(pose.rotation))
-        labels = ("x", "y", "z", "rx", "ry", "rz")
-        guess = {f"{name}.{label}": round_number(float(x)) for label, x in zip(labels, values, strict=True)}
-        robot.q_guess |= {label: x for label, x in guess.items() if x}
-        robot.guessed.append(
-            f"{link} is free, with the coordinates {name}.x to {name}.rz, because no joint fixes it to the world"
-        )
+        else:
+            robot.add_free_root(link, pose)
 
 
 def _parse_version(text: str, where: str) -> tuple[int, ...]:

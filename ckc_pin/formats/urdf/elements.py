@@ -22,6 +22,7 @@ __all__ = [
     "format_numbers",
     "from_pose",
     "make_visual",
+    "make_visuals",
     "move_visual",
     "parse_origin",
     "parse_vector",
@@ -110,6 +111,18 @@ def make_visual(pose: pin.SE3, shape: str, **sizes: str) -> Element:
     add_origin(visual, pose)
     SubElement(SubElement(visual, "geometry"), shape, sizes)
     return visual
+
+
+def make_visuals(pose: pin.SE3, shape: str, edges: Iterable[float], radius: float, length: float) -> list[Element]:
+    """Return a box, or a sphere, cylinder or capsule along z, as <visual> elements: a capsule is three of them."""
+    if shape == "box":
+        return [make_visual(pose, "box", size=format_numbers(edges))]
+    ends = {"sphere": [0.0], "cylinder": [], "capsule": [-length / 2, length / 2]}[shape]
+    places = [pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, z])) for z in ends]
+    visuals = [make_visual(place, "sphere", radius=repr(radius)) for place in places]
+    if shape != "sphere":
+        visuals.insert(0, make_visual(pose, "cylinder", radius=repr(radius), length=repr(length)))
+    return visuals
 
 
 def move_visual(visual: Element, pose: pin.SE3) -> Element:
