@@ -65,7 +65,7 @@ def new(folder: Path, as_json: bool) -> None:
     "file",
     metavar="FILE",
     type=options.PATH,
-    help="An MJCF of MuJoCo, an SDFormat, URDF or xacro file, or a robot.yaml or loop_closures.yaml next to its URDF.",
+    help="An MJCF, SDFormat, USD, URDF or xacro file, or a robot.yaml or loop_closures.yaml next to its URDF.",
 )
 @click.option(
     "--repair",

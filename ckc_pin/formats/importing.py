@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
+import numpy as np
 
 from ckc_pin.base.sources import parse_xml, write_texts
 from ckc_pin.base.toml import read_text
 from ckc_pin.base.toml_writer import LINE_WIDTH, format_key, format_value, to_table
-from ckc_pin.errors import ImportNote, InputError, printable
+from ckc_pin.errors import ImportNote, InputError, MechanismError, printable
 from ckc_pin.formats.conversion import make_unique
 from ckc_pin.formats.draft import Draft, choose_independent
 from ckc_pin.formats.loop_types import propose_loop_types
@@ -30,6 +31,7 @@ from ckc_pin.formats.urdf.loop_closures_yaml import LOOP_CLOSURES_YAML
 from ckc_pin.formats.urdf.reader import ROBOT_YAML, find_urdf_beside, read_urdf
 from ckc_pin.formats.urdf.xacro import expand_xacro, is_xacro
 from ckc_pin.formats.usd.reader import USD_SUFFIXES, read_usd
+from ckc_pin.kinematics.closing import close_loops
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.scene.names import DEFAULT, SUFFIX
@@ -37,6 +39,7 @@ from ckc_pin.scene.names import DEFAULT, SUFFIX
 __all__ = ["Draft", "draft_texts", "import_texts", "mechanism_text", "read", "read_robot", "write"]
 
 LOOP_TYPES = get_args(LoopType)
+MAX_UNSAID_MOVE = 1e-4  # rad or m; key frames have rounded numbers
 SCENE_SECONDS = 1.0  # of free motion in the scenes that import writes
 READERS = {"mujoco": read_mjcf, "robot": read_urdf, "sdf": read_sdf}  # by the root element
 
@@ -66,6 +69,7 @@ def read(path: Path, repair: bool = False) -> Draft:
     propose_loop_types(draft)
     _remove_loops_within_a_body(draft)
     choose_independent(draft)
+    _close_key_frames(draft)
     return draft
 
 
@@ -95,6 +99,30 @@ def read_robot(path: Path) -> Robot:
     robot = READERS[tag](text, path)
     robot.origin += ", expanded by xacro" if expanded else ""
     return robot
+
+
+def _close_key_frames(draft: Draft) -> None:
+    """Move each key frame to the nearest configuration that closes the loops, where a run can start."""
+    if not draft.key_frames or not (draft.loops or draft.couplings):
+        return
+    try:
+        mechanism = draft.build_mechanism()
+    except MechanismError:
+        return
+    tree, frames = mechanism.tree, draft.key_frames
+    draft.key_frames = {}
+    for name, config in frames.items():
+        numbers = np.array([config.get(label, 0.0) for label in tree.coordinates])
+        closed = close_loops(
+            tree, mechanism.closure, tree.from_coordinates(numbers), np.ones(tree.n), mechanism.tolerance, restarts=0
+        )
+        if closed.residual > mechanism.tolerance:
+            draft.left_out.append(f"key frame {name!r}, from where the loops do not close")
+            continue
+        values = tree.to_coordinates(closed.q_tree)
+        draft.key_frames[name] = dict(zip(tree.coordinates, values.tolist(), strict=True))
+        if (moved := float(np.abs(values - numbers).max())) > MAX_UNSAID_MOVE:
+            draft.guessed.append(f"key frame {name!r} starts where the loops close, {moved:.2g} rad or m away")
 
 
 def _remove_loops_within_a_body(draft: Draft) -> None:

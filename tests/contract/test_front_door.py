@@ -274,7 +274,7 @@ def test_placeholders_in_help_have_one_style(name: str) -> None:
 
 def test_invalid_choices_are_rejected_with_the_valid_ones() -> None:
     assert "'joint', 'cartesian'" in ckc("map", "five_bar", "--space", "outer").err
-    assert "'mjcf'" in ckc("export", "five_bar", "--to", "sdf").err
+    assert "'mjcf'" in ckc("export", "five_bar", "--to", "obj").err
 
 
 def test_spinner_appears_on_terminals_after_a_delay(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,7 +100,7 @@ def test_published_robots_are_moved_along_all_driven_freedoms(tmp_path: Path) ->
 
 def test_freedom_without_motor_is_named(tmp_path: Path) -> None:
     scene = write_with_scene(imported(tmp_path, legs(), YAML), tmp_path / "written")
-    with pytest.raises(InputError, match=r"a_hip cannot drive every freedom; the motion along b_knee is driven by"):
+    with pytest.raises(InputError, match=r"a_hip cannot drive every freedom; the motion along b_hip is driven by"):
         inverse_dynamics(scene, waves(load(tmp_path / "written" / "mechanism.toml"), 0.1))
 
 
