@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ __all__ = [
 
 PACKAGE = "package://"
 MAX_XML_DEPTH = 300  # nested elements; ElementTree writes by recursion
+COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 
 
 class Sources:
@@ -136,6 +138,10 @@ def _share_folders() -> list[Path]:
     return [wheel, Path(sys.prefix) / "share"]
 
 
+def _keep_lines(comment: re.Match[str]) -> str:
+    return "\n" * comment[0].count("\n")
+
+
 def parse_xml(text: str, source: str) -> ElementTree.Element:
     """Parse XML from an untrusted file: no error recovery, no document type, no entities, limited nesting.
 
@@ -173,6 +179,7 @@ def parse_xml(text: str, source: str) -> ElementTree.Element:
     stripped = text.lstrip("\ufeff \t\r\n")
     if stripped.startswith("<?xml"):  # published files have empty lines above the declaration, which XML forbids
         text = stripped
+    text = COMMENT.sub(_keep_lines, text)  # published files have "--" in comments, which XML forbids
     try:
         parser.Parse(text.encode(), True)
     except expat.ExpatError as error:

@@ -247,8 +247,10 @@ def test_attached_links_are_a_weld_as_they_are_drawn(tmp_path: Path) -> None:
     mechanism = draft.build_mechanism()
     assert (mechanism.n, mechanism.rank, mechanism.d) == (4, 3, 1)
     assert_close(mechanism.q_tree, np.zeros(4), 1e-12)
-    with pytest.raises(InputError, match="there is no frame 'nothing'"):
-        imported(tmp_path, model(FOUR_BAR + tip + plugin.replace("tip</child_link>", "nothing</child_link>")))
+    renamed = imported(tmp_path, model(FOUR_BAR + tip + plugin.replace("m</child_model>", "spawned_m</child_model>")))
+    assert renamed.build_mechanism().d == 1
+    lost = imported(tmp_path, model(FOUR_BAR + tip + plugin.replace("tip</child_link>", "nothing</child_link>")))
+    assert has_note(lost.warnings, "DetachableJoint of 'b' and 'nothing' is left out", "6 freedoms more")
 
 
 def test_a_link_and_a_joint_of_one_name_are_both_read(tmp_path: Path) -> None:
@@ -258,8 +260,8 @@ def test_a_link_and_a_joint_of_one_name_are_both_read(tmp_path: Path) -> None:
     assert draft.build_mechanism().coordinates == ("j1", "pin", "j2")
 
 
-def test_empty_lines_above_the_declaration_are_ignored(tmp_path: Path) -> None:
-    content = link("a") + joint("j1", "world", "a")
+def test_comments_and_empty_lines_above_the_declaration_are_ignored(tmp_path: Path) -> None:
+    content = "<!-- a line -- and\nanother -->" + link("a") + joint("j1", "world", "a")
     text = model(content)
     assert text.startswith("<?xml")
     assert imported(tmp_path, "\n\n" + text).build_mechanism().d == 1

@@ -337,15 +337,23 @@ class _Reader:
         robot.add_joint(replace(Joint.between(name, "ball", links, poses, ball_axes()), closes=True))
 
     def _add_detachable_joint(self, robot: Robot, element: Element, scope: str) -> None:
-        """Add a weld of two links as they are drawn, as Gazebo's plugin attaches them."""
-        where = f"{self.path}: plugin DetachableJoint"
-        model, ends = (element.findtext("child_model") or "").strip(), []
-        for tag, prefix in (
-            ("parent_link", ""),
-            ("child_link", "" if model in ("", scope.rpartition("::")[2]) else model),
-        ):
-            name = join(prefix, (element.findtext(tag) or "").strip())
-            ends.append(self.frames.link_of(self.frames.find(name, scope, f"{where}, <{tag}>"), where))
+        """Add a weld of two links as they are drawn, as Gazebo's plugin attaches them.
+
+        The child is in a model beside this one, or in this one, which Gazebo may call by another name when it runs.
+        """
+        model, parent, child = ((element.findtext(f"{tag}") or "").strip() for tag in
+                                ("child_model", "parent_link", "child_link"))  # fmt: skip
+        beside = join(scope.rpartition("::")[0], model)
+        ends = [
+            join(scope, parent),
+            next((x for x in (join(beside, child), join(scope, child)) if x in self.links), ""),
+        ]
+        if ends[0] not in self.links or ends[1:] in ([], ends[:1]):
+            robot.warnings.append(
+                f"Gazebo's DetachableJoint of {parent!r} and {child!r} is left out, because they are not two links of "
+                "this file; the mechanism has up to 6 freedoms more"
+            )
+            return
         poses = [self.frames.pose(end) for end in ends]
         links = [self._short(end) for end in ends]
         in_parent = [poses[0].inverse() * poses[1], pin.SE3.Identity()]
