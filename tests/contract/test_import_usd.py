@@ -108,6 +108,7 @@ def writer(tmp_path: Path) -> Writer:
 KINDS = {  # slides, hinges
     "revolute": ("", "Y"), "prismatic": ("Z", ""), "fixed": ("", ""), "ball": ("", "XYZ"),
     "universal": ("", "XZ"), "cylindrical": ("Y", "Y"), "planar": ("XZ", "Y"), "swivel": ("", "YZ"),
+    "cartesian": ("XYZ", ""), "slot": ("X", "Z"),
 }  # fmt: skip
 
 
@@ -455,8 +456,10 @@ def add_gear(writer: Writer) -> None:
     writer.stage.DefinePrim("/chain/gear", "PhysxPhysicsGearJoint")
 
 
-def add_odd_generic(writer: Writer) -> None:
-    writer.lock(writer.joint("Joint", "odd", (None, "a")), "rotX", "rotY", "rotZ")
+def add_tilted_lock(writer: Writer) -> None:
+    generic = writer.joint("Joint", "odd", (None, "a"))
+    writer.lock(generic, "transX", "transY", "transZ", "rotX")
+    writer.limit(generic, "rotZ", 20.0, 20.0)
 
 
 def add_reference(writer: Writer) -> None:
@@ -472,7 +475,7 @@ BAD: dict[str, tuple[Callable[[Writer], Any], str]] = {
     "itself": (add_hinge("a", "a"), r"/chain/j: it connects 'a' with itself; expected two bodies"),
     "world": (add_hinge(None, None), r"/chain/j: it connects 'world' with itself; expected two bodies"),
     "type": (add_gear, r"/chain/gear: unsupported joint type 'PhysxPhysicsGearJoint'; expected"),
-    "freedoms": (add_odd_generic, r"/chain/odd: a generic joint with the freedoms transX, transY, transZ is un"),
+    "angle": (add_tilted_lock, r"/chain/odd: an angle is locked at another value than 0 beside free angles"),
     "axis": (add_hinge(None, "a", Axis="W"), r"/chain/j: physics:axis = 'W'; expected X, Y or Z"),
     "limits": (add_hinge(None, "a", LowerLimit=2.0, UpperLimit=1.0), r"joint 'j': its lower limit .* is above"),
     "mass": (lambda writer: writer.body("heavy", None, -1.0), r"/chain/heavy: a negative mass"),
