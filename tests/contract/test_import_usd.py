@@ -21,7 +21,7 @@ import ckc_pin
 from ckc_pin import CkcError, InputError
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import ImportNote
-from ckc_pin.formats.importing import Draft, read
+from ckc_pin.formats.importing import Draft, read, read_robot
 from tests.conftest import assert_close
 from tests.contract.test_import_urdf import has_note
 
@@ -423,6 +423,38 @@ def test_mimic_and_distance_are_constraints(writer: Writer) -> None:
     assert [(spec.name, spec.type, spec.length) for spec, _ in draft.loops] == [("rod", "distance", 0.5)]
     assert has_note(draft.guessed, "c is free")
     assert has_note(draft.left_out, "joint rope")
+
+
+def test_frames_agree_with_the_parser_of_pxr(writer: Writer) -> None:
+    """Bodies with a scale, one of them a mirror, and joints to prims inside a body and to a prim that does not move."""
+    random = np.random.default_rng(3)
+    for name, scale in {"a": [2.0, 2.0, 2.0], "b": [-3.0, 1.0, 0.5], "static": [1.0, 1.0, 1.0]}.items():
+        turn = Rotation.from_euler("xyz", random.uniform(-1.0, 1.0, 3)).as_matrix()
+        body = writer.body(name, pose(random.uniform(-1.0, 1.0, 3), turn @ np.diag(scale)), **LINK)
+        UsdPhysics.RigidBodyAPI(body).CreateRigidBodyEnabledAttr(name != "static")
+    inner = UsdGeom.Xform.Define(writer.stage, "/chain/a/inner")
+    inner.AddTranslateOp().Set(Gf.Vec3d(0.3, 0.2, 0.1))
+    inner.AddRotateXOp().Set(40.0)
+    frames = [(random.uniform(-1.0, 1.0, 3).round(4), random.uniform(-1.0, 1.0, 4).round(4)) for _ in range(4)]
+    writer.joint("RevoluteJoint", "one", ("static", "a/inner"), *frames[:2], Axis="Z")
+    writer.joint("PrismaticJoint", "two", ("a", "b"), *frames[2:])
+    writer.stage.GetRootLayer().Save()
+    with pytest.warns(DeprecationWarning, match="deprecated"):  # its successor has no signature in Python yet
+        parsed = UsdPhysics.LoadUsdPhysicsFromRange(writer.stage, ["/"])
+    robot = read_robot(writer.path)
+    kinds = (UsdPhysics.ObjectType.RevoluteJoint, UsdPhysics.ObjectType.PrismaticJoint)
+    for kind, name in zip(kinds, ("one", "two"), strict=True):
+        ((joint,), ours) = parsed[kind][1], robot.joints[name]
+        for k, frame in enumerate((ours.in_parent, ours.in_child)):
+            quaternion = getattr(joint, f"localPose{k}Orientation")
+            theirs = Rotation.from_quat(
+                [quaternion.GetReal(), *quaternion.GetImaginary()], scalar_first=True
+            ).as_matrix()
+            position = np.array(getattr(joint, f"localPose{k}Position"))
+            if (name, k) == ("one", 0):  # pxr gives the frame in the prim; ours is in the world
+                continue
+            assert_close(frame.translation, position, 1e-6)
+            assert_close(frame.rotation, theirs, 1e-6)
 
 
 def test_kinematic_static_and_free_bodies(writer: Writer) -> None:
