@@ -21,7 +21,7 @@ import ckc_pin
 from ckc_pin import CkcError, InputError
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import ImportNote
-from ckc_pin.formats.importing import Draft, read
+from ckc_pin.formats.importing import Draft, read, read_robot
 from tests.conftest import assert_close
 from tests.contract.test_import_urdf import has_note
 
@@ -108,6 +108,7 @@ def writer(tmp_path: Path) -> Writer:
 KINDS = {  # slides, hinges
     "revolute": ("", "Y"), "prismatic": ("Z", ""), "fixed": ("", ""), "ball": ("", "XYZ"),
     "universal": ("", "XZ"), "cylindrical": ("Y", "Y"), "planar": ("XZ", "Y"), "swivel": ("", "YZ"),
+    "cartesian": ("XYZ", ""), "slot": ("X", "Z"),
 }  # fmt: skip
 
 
@@ -424,6 +425,38 @@ def test_mimic_and_distance_are_constraints(writer: Writer) -> None:
     assert has_note(draft.left_out, "joint rope")
 
 
+def test_frames_agree_with_the_parser_of_pxr(writer: Writer) -> None:
+    """Bodies with a scale, one of them a mirror, and joints to prims inside a body and to a prim that does not move."""
+    random = np.random.default_rng(3)
+    for name, scale in {"a": [2.0, 2.0, 2.0], "b": [-3.0, 1.0, 0.5], "static": [1.0, 1.0, 1.0]}.items():
+        turn = Rotation.from_euler("xyz", random.uniform(-1.0, 1.0, 3)).as_matrix()
+        body = writer.body(name, pose(random.uniform(-1.0, 1.0, 3), turn @ np.diag(scale)), **LINK)
+        UsdPhysics.RigidBodyAPI(body).CreateRigidBodyEnabledAttr(name != "static")
+    inner = UsdGeom.Xform.Define(writer.stage, "/chain/a/inner")
+    inner.AddTranslateOp().Set(Gf.Vec3d(0.3, 0.2, 0.1))
+    inner.AddRotateXOp().Set(40.0)
+    frames = [(random.uniform(-1.0, 1.0, 3).round(4), random.uniform(-1.0, 1.0, 4).round(4)) for _ in range(4)]
+    writer.joint("RevoluteJoint", "one", ("static", "a/inner"), *frames[:2], Axis="Z")
+    writer.joint("PrismaticJoint", "two", ("a", "b"), *frames[2:])
+    writer.stage.GetRootLayer().Save()
+    with pytest.warns(DeprecationWarning, match="deprecated"):  # its successor has no signature in Python yet
+        parsed = UsdPhysics.LoadUsdPhysicsFromRange(writer.stage, ["/"])
+    robot = read_robot(writer.path)
+    kinds = (UsdPhysics.ObjectType.RevoluteJoint, UsdPhysics.ObjectType.PrismaticJoint)
+    for kind, name in zip(kinds, ("one", "two"), strict=True):
+        ((joint,), ours) = parsed[kind][1], robot.joints[name]
+        for k, frame in enumerate((ours.in_parent, ours.in_child)):
+            quaternion = getattr(joint, f"localPose{k}Orientation")
+            theirs = Rotation.from_quat(
+                [quaternion.GetReal(), *quaternion.GetImaginary()], scalar_first=True
+            ).as_matrix()
+            position = np.array(getattr(joint, f"localPose{k}Position"))
+            if (name, k) == ("one", 0):  # pxr gives the frame in the prim; ours is in the world
+                continue
+            assert_close(frame.translation, position, 1e-6)
+            assert_close(frame.rotation, theirs, 1e-6)
+
+
 def test_kinematic_static_and_free_bodies(writer: Writer) -> None:
     for name in ("held", "static", "arm", "floating"):
         body = UsdPhysics.RigidBodyAPI(writer.body(name, pose((1.0, 2.0, 3.0), np.eye(3)), **LINK))
@@ -455,8 +488,10 @@ def add_gear(writer: Writer) -> None:
     writer.stage.DefinePrim("/chain/gear", "PhysxPhysicsGearJoint")
 
 
-def add_odd_generic(writer: Writer) -> None:
-    writer.lock(writer.joint("Joint", "odd", (None, "a")), "rotX", "rotY", "rotZ")
+def add_tilted_lock(writer: Writer) -> None:
+    generic = writer.joint("Joint", "odd", (None, "a"))
+    writer.lock(generic, "transX", "transY", "transZ", "rotX")
+    writer.limit(generic, "rotZ", 20.0, 20.0)
 
 
 def add_reference(writer: Writer) -> None:
@@ -472,7 +507,7 @@ BAD: dict[str, tuple[Callable[[Writer], Any], str]] = {
     "itself": (add_hinge("a", "a"), r"/chain/j: it connects 'a' with itself; expected two bodies"),
     "world": (add_hinge(None, None), r"/chain/j: it connects 'world' with itself; expected two bodies"),
     "type": (add_gear, r"/chain/gear: unsupported joint type 'PhysxPhysicsGearJoint'; expected"),
-    "freedoms": (add_odd_generic, r"/chain/odd: a generic joint with the freedoms transX, transY, transZ is un"),
+    "angle": (add_tilted_lock, r"/chain/odd: an angle is locked at another value than 0 beside free angles"),
     "axis": (add_hinge(None, "a", Axis="W"), r"/chain/j: physics:axis = 'W'; expected X, Y or Z"),
     "limits": (add_hinge(None, "a", LowerLimit=2.0, UpperLimit=1.0), r"joint 'j': its lower limit .* is above"),
     "mass": (lambda writer: writer.body("heavy", None, -1.0), r"/chain/heavy: a negative mass"),

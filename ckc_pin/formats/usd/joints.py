@@ -19,7 +19,7 @@ from ckc_pin.formats.conversion import from_axis_angle, round_number
 from ckc_pin.formats.robot import JointAxis, JointKind, JointLimits
 from ckc_pin.formats.usd.stage import Stage
 
-__all__ = ["DISTANCE", "Freedoms", "angles_of"]
+__all__ = ["DISTANCE", "JointFreedoms", "angles_of"]
 
 DISTANCE = "PhysicsDistanceJoint"
 DIRECTIONS = dict(zip("XYZ", np.eye(3), strict=True))
@@ -27,7 +27,7 @@ FREEDOMS = {  # by type; {} is the joint's axis
     **{"PhysicsFixedJoint": "", "PhysicsRevoluteJoint": "rot{}", "PhysicsPrismaticJoint": "trans{}"},
     **{"PhysicsSphericalJoint": "rotX rotY rotZ", "PhysicsJoint": "transX transY transZ rotX rotY rotZ"},
 }
-KINDS: dict[tuple[int, int], JointKind] = {  # by the numbers of slides and hinges
+KINDS: dict[tuple[int, int], JointKind] = {  # by the numbers of slides and hinges; otherwise a row of them
     **{(0, 0): "fixed", (0, 1): "revolute", (1, 0): "prismatic", (0, 2): "universal", (0, 3): "ball"},
     **{(1, 1): "cylindrical", (2, 1): "planar", (3, 3): "floating"},
 }
@@ -40,7 +40,7 @@ PROPERTIES = (  # of an axis: attribute, in which {} is the freedom, and its uni
 )
 
 
-class Freedoms:
+class JointFreedoms:
     """The freedoms of a joint: their names, axes and kind, and the displacement at which equal limits lock others."""
 
     def __init__(self, stage: Stage, prim: Any) -> None:
@@ -53,18 +53,14 @@ class Freedoms:
         if letter not in DIRECTIONS:
             raise InputError(f"{where}: physics:axis = {letter!r}; expected X, Y or Z")
         self.is_generic = type_name == "PhysicsJoint"
-        self.names = [name for name in FREEDOMS[type_name].format(letter).split() if not self._is_locked(name)]
+        self.declared = FREEDOMS[type_name].format(letter).split()
+        self.names = [name for name in self.declared if not self._is_locked(name)]
         slides, hinges = ([name[-1] for name in self.names if name.startswith(t)] for t in ("trans", "rot"))
-        kind = KINDS.get((len(slides), len(hinges)))
+        kind = KINDS.get((len(slides), len(hinges)), "hinges")
         is_aligned = {"cylindrical": slides == hinges, "planar": not set(hinges) & set(slides)}
-        if kind is None or not is_aligned.get(kind, True):
-            raise MechanismError(
-                f"{where}: a generic joint with the freedoms {', '.join(self.names)} is unsupported; expected those of "
-                f"a joint that is {', '.join(KINDS.values())}"
-            )
+        self.kind: JointKind = kind if is_aligned.get(kind, True) else "hinges"
         if hinges and not self.turn.isIdentity(0.0):
             raise MechanismError(f"{where}: an angle is locked at another value than 0 beside free angles; expected 0")
-        self.kind: JointKind = kind
         self.axes = [self._axis(name) for name in self.names]
 
     def unit(self, name: str, of: str) -> float:
@@ -89,7 +85,7 @@ class Freedoms:
 
     def _limits(self, name: str) -> tuple[float, float]:
         keys = ("limit:{}:physics:low", "limit:{}:physics:high")
-        keys = keys if self.is_generic else ("physics:lowerLimit", "physics:upperLimit")
+        keys = keys if len(self.declared) != 1 else ("physics:lowerLimit", "physics:upperLimit")
         low, high = self.find(keys[0], name, -math.inf), self.find(keys[1], name, math.inf)
         return low * self.unit(name, "rate"), high * self.unit(name, "rate")
 

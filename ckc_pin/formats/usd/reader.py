@@ -20,7 +20,7 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.conversion import choose_name, list_names, make_frame, make_unique, round_number, round_vector
 from ckc_pin.formats.robot import Joint, Link, Robot
 from ckc_pin.formats.usd.bodies import SHAPES, add_visuals, read_link
-from ckc_pin.formats.usd.joints import DISTANCE, Freedoms, angles_of
+from ckc_pin.formats.usd.joints import DISTANCE, JointFreedoms, angles_of
 from ckc_pin.formats.usd.stage import Stage
 from ckc_pin.mechanism.spec import LoopSpec, MotorSpec
 
@@ -124,7 +124,7 @@ class _Reader:
         if stage.value(prim, "physics:jointEnabled") is False:
             robot.left_out.append(f"joint {name}, which is not enabled")
             return
-        freedoms = None if prim.GetTypeName() == DISTANCE else Freedoms(stage, prim)
+        freedoms = None if prim.GetTypeName() == DISTANCE else JointFreedoms(stage, prim)
         links, poses, places = zip(*(self._end(prim, number) for number in (0, 1)), strict=True)
         if links[0] == links[1]:
             raise MechanismError(f"{stage.where(prim)}: it connects {links[0]!r} with itself; expected two bodies")
@@ -146,7 +146,7 @@ class _Reader:
         if any(stage.number(prim, f"physics:coneAngle{k}Limit", -1.0, finite=False) >= 0 for k in (0, 1)):
             robot.left_out.append(f"cone limit of joint {name}")
 
-    def _add_motor(self, robot: Robot, freedoms: Freedoms, freedom: str, coordinate: str) -> None:
+    def _add_motor(self, robot: Robot, freedoms: JointFreedoms, freedom: str, coordinate: str) -> None:
         if not freedoms.has_drive(freedom):
             return
         limit = freedoms.find("drive:{}:physics:maxForce", freedom, math.inf) * freedoms.unit(freedom, "force")

@@ -122,5 +122,5 @@ class Stage:
         left, _, right = np.linalg.svd(matrix[:3, :3] / scale)
         rotation = left @ right
         if np.linalg.det(rotation) < 0:
-            rotation[:, 0], scale[0] = -rotation[:, 0], -scale[0]
+            rotation, scale = -rotation, -scale  # as pxr factors a mirror
         return pin.SE3(self.up @ rotation, self.length * self.up @ matrix[:3, 3]), self.length * scale
