@@ -341,13 +341,11 @@ class _Reader:
 
         The child is in a model beside this one, or in this one, which Gazebo may call by another name when it runs.
         """
-        model, parent, child = ((element.findtext(f"{tag}") or "").strip() for tag in
-                                ("child_model", "parent_link", "child_link"))  # fmt: skip
+        tags = ("child_model", "parent_link", "child_link")
+        model, parent, child = ((element.findtext(tag) or "").strip() for tag in tags)
         beside = join(scope.rpartition("::")[0], model)
-        ends = [
-            join(scope, parent),
-            next((x for x in (join(beside, child), join(scope, child)) if x in self.links), ""),
-        ]
+        children = [name for name in (join(beside, child), join(scope, child)) if name in self.links]
+        ends = [join(scope, parent), *children[:1]]
         if ends[0] not in self.links or ends[1:] in ([], ends[:1]):
             robot.warnings.append(
                 f"Gazebo's DetachableJoint of {parent!r} and {child!r} is left out, because they are not two links of "
