@@ -26,6 +26,7 @@ from tests.conftest import assert_close
 from tests.contract.test_import_urdf import has_note
 
 AXES = np.eye(3)
+UNITS = [(1.0, 1.0, "Z"), (0.01, 0.001, "Y")]  # metres and kilograms per unit, up axis
 
 
 def pose(position: Sequence[float] | Array, rotation: Array) -> Array:
@@ -184,7 +185,7 @@ class Chain:
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("units", [(1.0, 1.0, "Z"), (0.01, 0.001, "Y")])
+@pytest.mark.parametrize("units", UNITS)
 def test_chain_has_the_mass_matrix_of_its_kinematics(
     tmp_path: Path, seed: int, units: tuple[float, float, str]
 ) -> None:
@@ -212,8 +213,10 @@ def tree_terms(mechanism: Any, q: Sequence[float]) -> tuple[Array, Array]:
     return upper + np.triu(upper, 1).T, pin.computeGeneralizedGravity(model, model.createData(), q_tree)
 
 
-def test_authored_pose_is_where_the_assembly_starts(writer: Writer) -> None:
+@pytest.mark.parametrize("units", UNITS)
+def test_authored_pose_is_where_the_assembly_starts(tmp_path: Path, units: tuple[float, float, str]) -> None:
     """Bodies that are drawn at other values of the joints than zero."""
+    writer = Writer(tmp_path / "chain.usda", *units)
     chain = Chain(writer, [*KINDS], 7)
     random, at, expected = np.random.default_rng(8), np.eye(4), {}
     for k, kind in enumerate(chain.kinds):
@@ -225,7 +228,7 @@ def test_authored_pose_is_where_the_assembly_starts(writer: Writer) -> None:
             at, expected[label] = at @ pose(axis * value * (j < len(slides)), turn), value
         at = at @ np.linalg.inv(chain.frames[k][1])
         prim = UsdGeom.Xformable(writer.stage.GetPrimAtPath(f"/chain/b{k}"))
-        prim.AddTransformOp().Set(Gf.Matrix4d(at.T))
+        prim.AddTransformOp().Set(Gf.Matrix4d(pose(at[:3, 3] / writer.length, at[:3, :3]).T))
     draft = writer.read()
     assert set(draft.q_guess) == set(expected)
     assert_close([draft.q_guess[label] for label in expected], [*expected.values()], 1e-12)
@@ -399,7 +402,8 @@ def test_limits_drives_and_properties_are_in_si_units(tmp_path: Path) -> None:
     assert still
 
 
-def test_mimic_and_distance_are_constraints(writer: Writer) -> None:
+def test_mimic_and_distance_are_constraints(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "cm.usda", 0.01)
     for name in "abc":
         writer.body(name, **LINK)
     one = writer.joint("RevoluteJoint", "one", (None, "a"))
@@ -419,8 +423,10 @@ def test_mimic_and_distance_are_constraints(writer: Writer) -> None:
     two.CreateRelationship("physxMimicJoint:rotX:referenceJoint").SetTargets([one.GetPath()])
     draft = writer.read()
     mimic = draft.robot.find("joint[@name='two']/mimic")
-    assert_close([float(mimic.get(key)) for key in ("multiplier", "offset")], [0.5 * 180 / math.pi, -0.25], 1e-13)
-    assert [(spec.name, spec.type, spec.length) for spec, _ in draft.loops] == [("rod", "distance", 0.5)]
+    assert_close(
+        [float(mimic.get(key)) for key in ("multiplier", "offset")], [0.5 * 0.01 * 180 / math.pi, -0.25 * 0.01], 1e-13
+    )
+    assert [(spec.name, spec.type, spec.length) for spec, _ in draft.loops] == [("rod", "distance", 0.005)]
     assert has_note(draft.guessed, "c is free")
     assert has_note(draft.left_out, "joint rope")
 
@@ -457,9 +463,10 @@ def test_frames_agree_with_the_parser_of_pxr(writer: Writer) -> None:
             assert_close(frame.rotation, theirs, 1e-6)
 
 
-def test_kinematic_static_and_free_bodies(writer: Writer) -> None:
+def test_kinematic_static_and_free_bodies(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "cm.usda", 0.01, 0.001, "Y")
     for name in ("held", "static", "arm", "floating"):
-        body = UsdPhysics.RigidBodyAPI(writer.body(name, pose((1.0, 2.0, 3.0), np.eye(3)), **LINK))
+        body = UsdPhysics.RigidBodyAPI(writer.body(name, pose((100.0, 200.0, 300.0), np.eye(3)), **LINK))
         if name == "held":
             body.CreateKinematicEnabledAttr(True)
         if name == "static":
@@ -467,14 +474,11 @@ def test_kinematic_static_and_free_bodies(writer: Writer) -> None:
     writer.joint("RevoluteJoint", "hip", ("arm", "static"))
     scene = UsdPhysics.Scene.Define(writer.stage, "/scene")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 2.0, 0.0))
-    scene.CreateGravityMagnitudeAttr(3.0)
+    scene.CreateGravityMagnitudeAttr(300.0)
     draft = writer.read()
-    assert draft.gravity == (0.0, 3.0, 0.0)
-    assert {key: value for key, value in draft.q_guess.items() if value} == {
-        "root.x": 1.0,
-        "root.y": 2.0,
-        "root.z": 3.0,
-    }
+    assert draft.gravity == (0.0, 0.0, 3.0)
+    assert_close([draft.q_guess[f"root.{key}"] for key in ("x", "y", "z", "rx")], [1.0, -3.0, 2.0, math.pi / 2], 1e-14)
+    assert "world" not in {child.get("link") for child in draft.robot.iterfind("joint/child")}
     mechanism = draft.build_mechanism()
     assert mechanism.n == 7
     assert "hip" in mechanism.coordinates
