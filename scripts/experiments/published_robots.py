@@ -2,9 +2,9 @@
 
     ./scripts/experiment robots FOLDER
 
-published_robots.toml lists the repositories with their commits and files. FOLDER holds a checkout of each of them at that
-commit, in a folder OWNER+NAME. Robots of example-robot-data come from its package (pip install example-robot-data). A
-missing file stops the script.
+published_robots.toml lists the repositories with their commits and files. FOLDER holds a checkout of each of them at
+that commit, in a folder OWNER+NAME. Robots of example-robot-data come from its package (pip install
+example-robot-data). A missing file stops the script.
 """
 
 from __future__ import annotations
