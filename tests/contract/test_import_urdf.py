@@ -7,9 +7,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial.transform import Rotation
 
 from ckc_pin import load
@@ -119,6 +122,27 @@ def test_couplings_of_generalized_rbda_are_imported(tmp_path: Path) -> None:
     assert (gear.joint, gear.other, gear.ratio, gear.offset) == ("spin", "hip", 6.0, 0.0)
     assert (belt.name, belt.joints, belt.offset) == ("belt", {"drive": 1.0, "knee": -2.0, "hip": -2.0}, 0.0)
     assert draft.build_mechanism().d == 2
+
+
+def test_rotors_behind_gears_are_those_of_drake(tmp_path: Path) -> None:
+    """Files for ROS and Drake have both reductions, of which Drake reads its own."""
+    content = (
+        "".join(link(name) for name in ("base", "arm", "hand")) + joint("a", "base", "arm") + joint("b", "arm", "hand")
+    )
+    for name, gear, rotor in (("a", 100.0, 6e-5), ("b", -7.0, 2e-4)):
+        content += f"""<transmission name="t{name}"><type>transmission_interface/SimpleTransmission</type>
+        <joint name="{name}"><hardwareInterface>EffortJointInterface</hardwareInterface></joint>
+        <actuator name="m{name}"><mechanicalReduction>1</mechanicalReduction><drake:gear_ratio value="{gear}"/>
+        <drake:rotor_inertia value="{rotor}"/></actuator></transmission>"""
+    mechanism = imported(tmp_path, content).build_mechanism()
+    plant = MultibodyPlant(0.0)
+    text = next(tmp_path.glob("*.urdf")).read_text()
+    Parser(plant).AddModelsFromString(text.replace("<robot", '<robot xmlns:drake="http://drake.mit.edu"', 1), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
+    plant.Finalize()
+    theirs = plant.CalcMassMatrix(plant.CreateDefaultContext())
+    D = pin.crba(mechanism.tree.model, mechanism.tree.data, mechanism.tree.neutral())
+    assert_close(np.triu(D), np.triu(theirs), 1e-12)
 
 
 def test_trees_beside_the_world_are_free(tmp_path: Path) -> None:

@@ -73,12 +73,15 @@ def _number(text: str | None, default: float, where: str) -> float:
 
 
 def _reduction(element: Element | None, default: float, where: str) -> float:
-    """Return the reduction of a transmission or of its actuator or joint: ROS 1's and ROS 2's element, or Drake's."""
+    """Return the reduction of a transmission or of its actuator or joint: Drake's element, or ROS 1's or ROS 2's.
+
+    Drake reflects the rotor by its own element, also where ROS has a reduction of 1 for a drive that hides its gear.
+    """
     if element is None:
         return default
     drake = element.find("drake:gear_ratio")
-    texts = [element.findtext("mechanicalReduction"), element.findtext("mechanical_reduction")]
-    texts.append(None if drake is None else drake.get("value"))
+    texts = [None if drake is None else drake.get("value")]
+    texts += [element.findtext("mechanicalReduction"), element.findtext("mechanical_reduction")]
     value = _number(next((text for text in texts if text is not None), None), default, where)
     if not value:
         raise InputError(f"{where}: its mechanical reduction is 0; expected a ratio")
