@@ -24,7 +24,7 @@ struct Energy {
 
 // Values that rows follow: phi = residual - value. Zero for rows that close loops.
 struct RowMotion {
-  Vector value, rate, acceleration;  // (rows)
+  Vector value, rate;  // (rows)
 };
 
 struct Scales {
@@ -239,6 +239,7 @@ class Core {
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
+  bool inertia_metric_step(In residual, double min_pivot, Out x);  // `closure_step` in the metric of D' only
   bool compute_released_directions();
   bool add_released_motion(In force, Out a);  // so that D' a = force along the motions of the released rows
   struct Components;                         // velocity components of the bodies

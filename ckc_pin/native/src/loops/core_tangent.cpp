@@ -138,7 +138,11 @@ bool Core::cheapest_closure_step(In residual, Out x) {
 
 bool Core::closure_step(In residual, Out x) {
   if (compiled && compiled->closure_step(q_tree, residual, x)) return true;
-  if (!find_tangent_basis(residual, min_pivot_for_inertia_metric)) return minimum_norm_closure_step(residual, x);
+  return inertia_metric_step(residual, min_pivot_for_inertia_metric, x) || minimum_norm_closure_step(residual, x);
+}
+
+bool Core::inertia_metric_step(In residual, double min_pivot, Out x) {
+  if (!find_tangent_basis(residual, min_pivot)) return false;
   factorize_tangent_inertia();
   multiply_D_tree(x_, y_);
   y_ = -y_;
@@ -180,11 +184,7 @@ bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
 bool Core::unit_row_response(int row, Out x) {
   compute_J();
   residual_.setZero(), residual_(row) = -1.0;
-  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
-  factorize_tangent_inertia();
-  multiply_D_tree(x_, y_);
-  y_ = -y_;
-  add_force_response(y_, x);
+  if (!inertia_metric_step(residual_, rank_lost_pivot, x)) return false;
   if (released_.empty()) return true;
   y_.setZero();
   return add_released_motion(y_, x);

@@ -62,8 +62,7 @@ bool PrescribedJoint::Switch::is_due(double t, const Indices& occurred) const {
 void System::prescribe(std::vector<PrescribedJoint> joints) {
   prescribed_ = std::move(joints);
   const int rows = core.constraints.closure.rows;
-  for (Vector* x : {&core.row_motion.value, &core.row_motion.rate, &core.row_motion.acceleration, &lambda_})
-    x->setZero(rows);
+  for (Vector* x : {&core.row_motion.value, &core.row_motion.rate, &lambda_}) x->setZero(rows);
   for (const PrescribedJoint& joint : prescribed_) free_size_ += joint.can_be_free() ? 2 : 0;
   size = coupled_size();
   crosses_singularities &= !free_size_;  // collocation steps integrate the motion alone
@@ -92,8 +91,7 @@ void System::set_row(const PrescribedJoint& joint) {
   core.row_motion.value(joint.row) = joint.position - joint.offset;
   core.row_motion.rate(joint.row) = joint.rate;
   // `acceleration` of a free joint is a result, which the core adds itself.
-  core.row_motion.acceleration(joint.row) = joint.is_free ? 0.0 : joint.acceleration;
-  row_correction_(joint.row) = -core.row_motion.acceleration(joint.row);
+  row_correction_(joint.row) = joint.is_free ? 0.0 : -joint.acceleration;
 }
 
 bool System::set_time(double t) {
