@@ -135,9 +135,8 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
 
     with Spinner(f"export of {mechanism}"):
         loaded = ckc_pin.load(mechanism)
-        exported = exporting.export(loaded, to)
-        if to == "mjcf" and find_spec("mujoco") is not None:
-            exported = _choose_time_step(loaded, exported)
+        is_measured = to == "mjcf" and find_spec("mujoco") is not None
+        exported = _export_to_mujoco(loaded) if is_measured else exporting.export(loaded, to)
     paths = [] if out is None else [exporting.write(exported, out, overwrite)]
     if as_json:
         text = {} if paths else {"text": exported.text}
@@ -152,7 +151,7 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
         (print if paths else error_console().print)(f"differs: {difference}")
 
 
-def _choose_time_step(mechanism: ckc_pin.Mechanism, exported: Exported) -> Exported:
+def _export_to_mujoco(mechanism: ckc_pin.Mechanism) -> Exported:
     """Export to MuJoCo with the largest of a few time steps at which its motion agrees, and say how well it does."""
     from ckc_pin.analysis.precision.mujoco import measure_deviation
     from ckc_pin.formats import exporting

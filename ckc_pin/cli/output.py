@@ -42,7 +42,7 @@ __all__ = [
     "reset_json",
     "skip_figures_without_matplotlib",
     "write_csv",
-]  # fmt: skip
+]
 
 LONG_S = 10.0  # a command that may take longer announces it
 ESTIMATE_DELAY_S = 2.0  # the remaining time is estimated from the progress in this time

@@ -54,7 +54,7 @@ def loop_joint(mechanism: Mechanism, loop: LoopSpec, program: str) -> LoopJoint:
     Raises
     ------
     InputError
-        No joint does what the loop does.
+        The program has no joint that allows the same motions.
     """
     if loop.type not in JOINT_KINDS:
         raise InputError(

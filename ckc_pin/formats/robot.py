@@ -156,7 +156,7 @@ class Joint:
 
 @dataclass(kw_only=True)
 class Tables:
-    """What a robot has besides its links and joints: tables of ``mechanism.toml``, and notes for the user."""
+    """Tables of ``mechanism.toml`` besides links and joints, and notes for the user."""
 
     name: str  # of the mechanism and its URDF
     origin: str  # the file and its format
@@ -174,7 +174,7 @@ class Tables:
     gravity: Vector3 = (0.0, 0.0, -9.81)
     q_guess: dict[str, float] = field(default_factory=dict)  # start of the assembly by coordinate
     key_frames: dict[str, dict[str, float]] = field(default_factory=dict)  # other configurations by name
-    guessed: list[str] = field(default_factory=list)  # what the file does not say, and what was assumed
+    guessed: list[str] = field(default_factory=list)  # assumptions where the file says nothing
     left_out: list[str] = field(default_factory=list)  # content of the file that the mechanism does not have
     warnings: list[str] = field(default_factory=list)  # why it has other freedoms than the file means
 

@@ -81,8 +81,7 @@ def prescribed_motions(prescribed: Sequence[PrescribedSpec]) -> list[Desired]:
     motions: list[Desired] = []
     for one in prescribed:
         where = f"prescribed, joint {one.joint!r}"
-        numbers = isinstance(one.begins, float) and isinstance(one.ends, float)
-        if numbers and not one.begins < one.ends:  # type: ignore[operator]
+        if isinstance(one.begins, float) and isinstance(one.ends, float) and not one.begins < one.ends:
             raise InputError(f"{where}: ends = {one.ends} has to be greater than begins = {one.begins}")
         motion = make_motion([one], [where])
         jump = find_rate_jump(motion, math.inf)

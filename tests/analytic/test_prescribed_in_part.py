@@ -93,7 +93,10 @@ def fall(until: float, event: Any = None) -> Any:
 
 def fall_to_contact() -> Any:
     """The free motion until theta_3 falls through -1.65."""
-    crosses = lambda _t, y: y[1] + 1.65  # noqa: E731
+
+    def crosses(_t: float, y: Array) -> Any:
+        return y[1] + 1.65
+
     crosses.terminal, crosses.direction = True, -1  # type: ignore[attr-defined]
     return fall(1.0, crosses)
 

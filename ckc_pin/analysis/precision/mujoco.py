@@ -167,25 +167,22 @@ def measure_deviation(mechanism: Mechanism, mjcf: str) -> tuple[float, float]:
     CkcError
         The motion cannot be computed.
     """
-    import mujoco
-
     rates = {name: float(mechanism.tree.step_scale[mechanism.tree.index[name]]) for name in mechanism.independent}
     start = {"at": "assembled", "q_dot": rates}
     scene = Scene(
         mechanism, t_end=DEVIATION_TIME_S, formulation="dae", initial=start,
         solver={"rtol": DEVIATION_RTOL, "output_dt": DEVIATION_OUTPUT_S},
     )  # fmt: skip
-    run, model = simulate(scene), load_model(mjcf)
-    data, states, deviation = mujoco.MjData(model), StateMap(mechanism, model), 0.0
-    tree = mechanism.tree
-    states.set_state(data, tree.from_coordinates(run.q_tree[0]), run.v_tree[0])
-    for t, q_tree in zip(run.t[1:], run.q_tree[1:], strict=True):
-        while data.time < t - model.opt.timestep / 2:
-            mujoco.mj_step(model, data)
-        if not np.all(np.isfinite(data.qpos)):
+    run, model, tree = simulate(scene), load_model(mjcf), mechanism.tree
+    program = make_program(model, mechanism, (tree.from_coordinates(run.q_tree[0]), run.v_tree[0]))
+    program.reset()
+    deviation, steps = 0.0, np.round(run.t / model.opt.timestep).astype(int)
+    for count, q_tree in zip(np.diff(steps), run.q_tree[1:], strict=True):
+        program.step(int(count))
+        numbers, _ = program.state()
+        if not np.all(np.isfinite(numbers)):
             return np.inf, float(run.t[-1])
-        q_mujoco = tree.from_coordinates(states.get_state(data)[0])
-        difference = tree.difference(tree.from_coordinates(q_tree), q_mujoco)
+        difference = tree.difference(tree.from_coordinates(q_tree), tree.from_coordinates(numbers))
         deviation = max(deviation, float(np.abs(difference).max()))
     return deviation, float(run.t[-1])
 

@@ -11,11 +11,20 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
-from ckc_pin.formats.conversion import from_quaternion, from_rpy, require_direction
-from ckc_pin.formats.robot import Body, JointAxis, JointKind, JointLimits, Link, ball_axes
+from ckc_pin.formats.conversion import from_quaternion, from_rpy, make_unique, require_direction
+from ckc_pin.formats.robot import Body, Joint, JointAxis, JointKind, JointLimits, Link, Robot, ball_axes
 from ckc_pin.formats.urdf.elements import make_visual
 
-__all__ = ["JOINT_KINDS", "parse_pose", "read_axes", "read_link", "read_number", "read_numbers", "read_pitch"]
+__all__ = [
+    "JOINT_KINDS",
+    "attach_links",
+    "parse_pose",
+    "read_axes",
+    "read_link",
+    "read_number",
+    "read_numbers",
+    "read_pitch",
+]
 
 UNBOUNDED = ("lower", "upper", "effort", "velocity")  # may be infinite
 NO_LIMIT = 1e16  # SDFormat's value for an unlimited joint
@@ -168,6 +177,24 @@ def _read_axis(element: Element, direction: Array, slides: bool, where: str) -> 
         )
         axis.mimic = (mimic.get("joint", ""), ratio, offset - ratio * reference)
     return axis
+
+
+def attach_links(robot: Robot, parent: str, child: str, pose_of: Callable[[str], pin.SE3]) -> bool:
+    """Add a weld of two links as they are drawn, as Gazebo's plugin DetachableJoint attaches them.
+
+    `pose_of` returns the pose of a link in the world. If they are not two links of the robot, a warning says so, and
+    the result is False.
+    """
+    if parent not in robot.links or child not in robot.links or parent == child:
+        robot.warnings.append(
+            f"Gazebo's DetachableJoint of {parent!r} and {child!r} is left out, because they are not two links of this "
+            "robot; the mechanism has up to 6 freedoms more"
+        )
+        return False
+    in_parent = pose_of(parent).inverse() * pose_of(child)
+    name = make_unique(f"{parent}_{child}", robot.joints)
+    robot.add_joint(Joint(name, "fixed", parent, child, in_parent, closes=True))
+    return True
 
 
 def read_pitch(element: Element, where: str) -> float:

@@ -21,7 +21,15 @@ from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.conversion import choose_name, list_names, make_unique, round_number, round_vector
 from ckc_pin.formats.repository import find_in_repository
 from ckc_pin.formats.robot import Joint, Link, Robot, ball_axes
-from ckc_pin.formats.sdf.elements import JOINT_KINDS, parse_pose, read_axes, read_link, read_numbers, read_pitch
+from ckc_pin.formats.sdf.elements import (
+    JOINT_KINDS,
+    attach_links,
+    parse_pose,
+    read_axes,
+    read_link,
+    read_numbers,
+    read_pitch,
+)
 from ckc_pin.formats.sdf.frames import MODEL_FRAME, WORLD, FrameGraph, join
 from ckc_pin.mechanism.spec import CouplingSpec
 
@@ -337,26 +345,15 @@ class _Reader:
         robot.add_joint(replace(Joint.between(name, "ball", links, poses, ball_axes()), closes=True))
 
     def _add_detachable_joint(self, robot: Robot, element: Element, scope: str) -> None:
-        """Add a weld of two links as they are drawn, as Gazebo's plugin attaches them.
-
-        The child is in a model beside this one, or in this one, which Gazebo may call by another name when it runs.
-        """
+        """Attach two links. The child is in a model beside this one, or in this one under any name."""
         tags = ("child_model", "parent_link", "child_link")
         model, parent, child = ((element.findtext(tag) or "").strip() for tag in tags)
-        beside = join(scope.rpartition("::")[0], model)
-        children = [name for name in (join(beside, child), join(scope, child)) if name in self.links]
-        ends = [join(scope, parent), *children[:1]]
-        if ends[0] not in self.links or ends[1:] in ([], ends[:1]):
-            robot.warnings.append(
-                f"Gazebo's DetachableJoint of {parent!r} and {child!r} is left out, because they are not two links of "
-                "this file; the mechanism has up to 6 freedoms more"
-            )
-            return
-        poses = [self.frames.pose(end) for end in ends]
-        links = [self._short(end) for end in ends]
-        in_parent = [poses[0].inverse() * poses[1], pin.SE3.Identity()]
-        name = make_unique("_".join(links), robot.joints)
-        robot.add_joint(replace(Joint.between(name, "fixed", links, in_parent, []), closes=True))
+        beside = join(join(scope.rpartition("::")[0], model), child)
+        full = {self._short(name): name for name in (join(scope, parent), join(scope, child), beside)}
+        other = next(
+            (name for name in (self._short(beside), self._short(join(scope, child))) if name in robot.links), child
+        )
+        attach_links(robot, self._short(join(scope, parent)), other, lambda name: self.frames.pose(full[name]))
 
     def _add_gearbox(self, robot: Robot, pending: _Pending, where: str) -> None:
         """Add angle of the child = -ratio * angle of the parent, both relative to the reference body."""

@@ -29,7 +29,7 @@ SHAPES = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius
 
 
 def to_sdf(mechanism: Mechanism) -> tuple[str, list[str]]:
-    """Return a mechanism as an SDFormat world, and what differs there.
+    """Return a mechanism as an SDFormat world, and notes on differences.
 
     A joint with a motor has Gazebo's plugin that applies a force, and an effort limit other than 0, as Drake expects.
 

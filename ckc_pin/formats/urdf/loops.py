@@ -14,7 +14,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.formats.conversion import make_unique, require_direction, round_number
 from ckc_pin.formats.robot import Joint, JointAxis, JointKind, Robot, ball_axes
-from ckc_pin.formats.sdf.elements import JOINT_KINDS, parse_pose, read_axes, read_number, read_pitch
+from ckc_pin.formats.sdf.elements import JOINT_KINDS, attach_links, parse_pose, read_axes, read_number, read_pitch
 from ckc_pin.formats.urdf.elements import from_pose, parse_vector
 from ckc_pin.mechanism.spec import CouplingSpec
 
@@ -226,16 +226,6 @@ def _add_mimic_plugin(element: Element, robot: Robot) -> list[str]:
 
 
 def _add_detachable_joint(element: Element, robot: Robot) -> list[str]:
-    """Add a weld of two links at their poses at zero."""
-    links = [(element.findtext(tag) or "").strip() for tag in ("parent_link", "child_link")]
-    if any(link not in robot.links for link in links) or links[0] == links[1]:
-        robot.warnings.append(
-            f"Gazebo's DetachableJoint of {links[0]!r} and {links[1]!r} is left out, because they are not two links of "
-            "this robot; the mechanism has up to 6 freedoms more"
-        )
-        return []
-    poses = robot.zero_poses()
-    name = make_unique(f"{links[0]}_{links[1]}", robot.joints)
-    in_parent = poses[links[0]].inverse() * poses[links[1]]
-    robot.add_joint(Joint(name, "fixed", links[0], links[1], in_parent, closes=True))
-    return ["Gazebo's DetachableJoint"]
+    parent, child = ((element.findtext(tag) or "").strip() for tag in ("parent_link", "child_link"))
+    is_attached = attach_links(robot, parent, child, robot.zero_poses().__getitem__)
+    return ["Gazebo's DetachableJoint"] if is_attached else []

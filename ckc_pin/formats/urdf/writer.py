@@ -24,7 +24,7 @@ DRAWN_SHAPES = ("box", "cylinder", "sphere")
 
 
 def to_urdf(mechanism: Mechanism) -> tuple[str, list[str]]:
-    """Return a mechanism as a URDF, and what it does not contain.
+    """Return a mechanism as a URDF, and notes on parts of the mechanism that it lacks.
 
     The tree has the mechanism's links, joints and coordinates. Loops are <loop> elements, as in generalized_rbda;
     other programs ignore them. Gears between two joints are <mimic>, motors on one joint <transmission>.
@@ -77,10 +77,8 @@ def to_urdf(mechanism: Mechanism) -> tuple[str, list[str]]:
 def largest_effort(mechanism: Mechanism, k: int) -> float | None:
     """Return the largest force or torque of a motor on coordinate k alone, infinite without a limit; None: no motor."""
     motors = mechanism.motors
-    for turns, limits in zip(motors.transmission, motors.torque_limit.T, strict=True):
-        if np.flatnonzero(turns).tolist() == [k]:
-            return float(np.abs(turns[k] * limits).max())
-    return None
+    motor = motors.motor_on(k)
+    return None if motor is None else float(np.abs(motors.transmission[motor, k] * motors.torque_limit[:, motor]).max())
 
 
 def follower_of(mechanism: Mechanism, coupling: CouplingSpec, program: str) -> tuple[str, str, float, float]:
