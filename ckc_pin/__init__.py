@@ -20,7 +20,7 @@ Subpackages, bottom to top; a module imports only from subpackages below its own
 `linear`, `sensitivity`      linear models and stability; derivatives of runs, Floquet multipliers
 `ensembles`                  many runs with different parameters
 `formats`, `analysis`        import and export; checks, singularity maps, work-precision reports
-`view`, `cli`                figures and 3-D playback; the command `ckc`
+`view`, `explore`, `cli`     figures and 3-D playback; the explorer in the browser; the command `ckc`
 ============================ ==========================================================================
 
 docs/architecture.md describes them, and what happens in a call of `simulate`.
