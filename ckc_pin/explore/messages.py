@@ -452,6 +452,10 @@ class RunReport(Report, frozen=True, kw_only=True):
         Why it stopped, or a remark.
     real_time
         Simulated seconds per second that were reached; it is less than the speed if the computation is too slow.
+    mode
+        Mode of the last `start_run`; "" before the first.
+    motors
+        What `set_motor` sets, by name: torques in mode "free", targets in mode "hold". Other modes: empty.
     """
 
     state: Literal["none", "running", "paused", "stopped"] = "none"
@@ -459,6 +463,8 @@ class RunReport(Report, frozen=True, kw_only=True):
     t_last: float = 0.0
     message: str = ""
     real_time: float = 0.0
+    mode: str = ""
+    motors: dict[str, float] = {}
 
 
 class TextReport(Report, frozen=True, kw_only=True):
