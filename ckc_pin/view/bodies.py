@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from ckc_pin.view.links import SLIDER_LENGTH, Bar, Plate, compute_rank, find_gro
 from ckc_pin.view.visuals import Colour, Surface, Visual, load_surface, read_visuals
 
 __all__ = ["GHOST", "SOLID", "TRANSLUCENT", "Appearance", "body_path", "draw_bodies", "draw_gaps", "draw_loop_frames",
-           "escape_path", "find_missing_meshes", "gap_path", "place_bodies"]  # fmt: skip
+           "escape_path", "find_missing_meshes", "gap_path", "place_bodies", "stretch_gaps"]  # fmt: skip
 
 BASE_COLOUR: Colour = (0.45, 0.47, 0.50)
 FRAME_A_COLOUR: Colour = (0.10, 0.10, 0.10)
@@ -41,6 +41,7 @@ LINK_COLOURS: tuple[Colour, ...] = (  # the palette of Okabe and Ito
 ROD_RADIUS = 0.03
 SLIDER_WIDTH = 0.06
 GAP_ROD_RADIUS = 0.008
+MIN_GAP_LENGTH = 1e-9  # m; a vector of length zero has no direction
 FRAME_A_RADIUS, FRAME_B_RADIUS = 0.018, 0.03
 THICKNESSES = 7  # of plates
 
@@ -247,3 +248,30 @@ def draw_gaps(mechanism: Mechanism, root: str, appearance: Appearance) -> Iterat
         path = gap_path(root, loop)
         yield commands.draw_primitive(f"{path}/way/rod", "cylinder", [radius, 1.0], middle, material)
         yield commands.draw_primitive(f"{path}/end/ball", "sphere", [2.5 * radius], np.eye(4), material)
+
+
+def stretch_gaps(
+    mechanism: Mechanism, root: str, poses: Placements, offsets: Mapping[str, Array]
+) -> dict[str, dict[str, Array]]:
+    """Return how each loop's rod and ball of `draw_gaps` are placed so that the rod reaches from frame B to an offset.
+
+    Parameters
+    ----------
+    offsets : mapping of str to (m, 3) array
+        By loop, in the world's axes, m.
+
+    Returns
+    -------
+    dict of str to dict of str to array
+        By path, "position" (m, 3), and for rods "quaternion" (m, 4) and "scale" (m, 3).
+    """
+    frames = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
+    z, placements = np.array([0.0, 0.0, 1.0]), {}
+    for loop, vectors in offsets.items():
+        start = poses.point_positions(frames[loop].joint, frames[loop].translation)
+        lengths = np.maximum(np.linalg.norm(vectors, axis=1), MIN_GAP_LENGTH)
+        scale = np.column_stack([np.ones((len(vectors), 2)), lengths])
+        rotations = np.array([pin.Quaternion.FromTwoVectors(z, vector).coeffs() for vector in vectors])
+        placements[f"{gap_path(root, loop)}/way"] = {"position": start, "quaternion": rotations, "scale": scale}
+        placements[f"{gap_path(root, loop)}/end"] = {"position": start + vectors}
+    return placements
