@@ -352,18 +352,19 @@ class Simulator(HasSummary):
                 "simulator with such a scene and controlled=True"
             )
         present = law.desired(self._state.t)[0] if self._desired is None else self._desired
+        values = present
         if desired is not None:
             names = self.mechanism.independent
             table = {**dict(zip(names, present, strict=True)), **desired} if isinstance(desired, Mapping) else desired
-            values = require_u(table, self.mechanism, "step: desired")
+            values = require_u(table, self.mechanism, "step: desired").copy()
             if not np.all(np.isfinite(values)):
                 raise InputError(f"step: desired is not finite: {values.tolist()}")
-            self._desired_moves = not np.array_equal(values, present) or self._desired is None
-        else:
-            values, self._desired_moves = present, False
+        begins = self._desired is None or not np.array_equal(values, present)
+        if not (begins or self._desired_moves):
+            return  # They are at rest there already.
         if not self._loop.move_desired(until, values):
             raise InputError("step: desired: the controller's desired motion is a function of Python; give a table")
-        self._desired = values.copy()
+        self._desired, self._desired_moves = values, begins
 
     def _read_state(self) -> State:
         """Return the loop's state, or the last one if the terms of the loop's state cannot be evaluated."""
