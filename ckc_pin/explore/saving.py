@@ -15,8 +15,9 @@ from ckc_pin.base.toml_writer import to_toml_value, write_toml
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.scene.names import SUFFIX
 from ckc_pin.scene.saving import scene_texts
-from ckc_pin.scene.scene import SUFFIX, Scene
+from ckc_pin.scene.scene import Scene
 from ckc_pin.view.geometry import compute_placements, is_planar, projection_planes
 from ckc_pin.view.links import find_link_shapes
 from ckc_pin.view.outlines import GROUND_COLOUR, project_base, project_outline

@@ -120,9 +120,7 @@ class Simulator(HasSummary):
         self._loop = self._prepared.loop
         self.mechanism = self._prepared.mechanism
         self.controller: Controller | TorqueController | None = (
-            unwrap_sampled(self._prepared.controller)
-            if controlled
-            else build_scene_controller(scene, self.mechanism)
+            unwrap_sampled(self._prepared.controller) if controlled else build_scene_controller(scene, self.mechanism)
         )
         self._u_refusal = self._prepared.actuation.explain_undriven_freedoms(self._prepared.start.at)
         self._zero_u = np.zeros(self.mechanism.d)
@@ -340,7 +338,9 @@ class Simulator(HasSummary):
         choices = ", ".join(self._wrenches) or "none; add Force(frame, [0.0, 0.0, 0.0], name=...) to forces"
         others = [force.name for force in self._prepared.forces]
         if name in others:
-            return f"the force {name!r} is a function of time or of the state and cannot be set; constant are: {choices}"
+            return (
+                f"the force {name!r} is a function of time or of the state and cannot be set; constant are: {choices}"
+            )
         return f"there is no force {name!r:.80}; constant forces are: {choices}"
 
     def _move_desired(self, desired: Any, until: float) -> None:
