@@ -83,6 +83,7 @@ class LiveFrame:
 class _Frame:
     """A computed frame, as it is stored. `desired` are the targets at its time in mode "hold"."""
 
+    number: int
     state: State
     tau: Array
     push: Array | None
@@ -214,8 +215,9 @@ class LiveRun:
         self._tau = np.zeros(len(self.mechanism.actuated))
         self._target = self._desired = start.q.copy()
         self._pull: _Push | None = None
-        self._frames = [_Frame(start, self._simulator.tau, None, self._desired)]
+        self._frames = [_Frame(0, start, self._simulator.tau, None, self._desired)]
         self._times = [start.t]
+        self._stride = 1  # Frames whose numbers are multiples of it are stored, and the last one.
         self._inputs = [_Input(start.t, {}, self._tau)]
         self._knots = [(start.t, self._desired)]  # of the targets' piecewise linear motion
         self._shown = 0  # index of the frame that is shown
@@ -435,7 +437,8 @@ class LiveRun:
             reached = simulator.step(None, dt, tau=tau if len(tau) else None, wrenches=wrenches)
         else:
             reached = simulator.step(None, dt, wrenches=wrenches, desired=desired if moved else None)
-        return _Frame(reached, simulator.tau, push, desired), _Input(state.t, acting, tau), moved
+        number = self._frames[-1].number + 1
+        return _Frame(number, reached, simulator.tau, push, desired), _Input(state.t, acting, tau), moved
 
     def _store(self, frame: _Frame, given: _Input, moved: bool) -> float:
         """Store a frame and return its duration, s: 0 if the run has been rewound in the meantime."""
@@ -449,14 +452,16 @@ class LiveRun:
                     self._knots.append((given.t, self._desired))
                 self._knots.append((frame.state.t, frame.desired))
             self._desired = frame.desired
-            follows = self._shown == len(self._frames) - 1
+            follows, t_shown = self._shown == len(self._frames) - 1, self._times[self._shown]
+            if self._frames[-1].number % self._stride and follows:
+                del self._frames[-1], self._times[-1]
             self._frames.append(frame)
             self._times.append(frame.state.t)
             if len(self._frames) > self._max_frames:
-                self._frames[1:-1], self._times[1:-1] = self._frames[2:-1:2], self._times[2:-1:2]
-                self._shown //= 2
-            if follows:
-                self._shown = len(self._frames) - 1
+                self._stride *= 2
+                self._frames = [x for x in self._frames[:-1] if x.number % self._stride == 0] + [frame]
+                self._times = [x.state.t for x in self._frames]
+            self._shown = len(self._frames) - 1 if follows else bisect_right(self._times, t_shown) - 1
             now = time.monotonic()
             self._reached.append((now, frame.state.t))
             while now - self._reached[0][0] > RATE_WINDOW_S and len(self._reached) > 2:
