@@ -1,4 +1,4 @@
-"""Holding torques of a pose, and the forces of its loops and joints."""
+"""StaticForces torques of a pose, and the forces of its loops and joints."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ class HoldingTorques(Quantity):
 
     def evaluate(self, state: PoseState, shown: ShownQuantities) -> list[list[str]]:
         """Return h by coordinate, tau by motor, and what remains if the motors cannot hold the pose."""
-        mechanism, holding = self.mechanism, state.holding
+        mechanism, static = self.mechanism, state.static_forces
         names = mechanism.independent
         units = [effort(mechanism.tree.units()[k]) for k in mechanism.partition.q]
         lines = _label("h of", names, state.rest.h, units)
-        lines += _label("motor", mechanism.actuated, holding.tau, motor_units(mechanism))
-        if holding.reason:
-            lines.append(["not held", holding.reason])
-            lines += _label("remains along", names, holding.missing, units)
-        if holding.loaded_stops:
-            lines.append(["stops that hold it", ", ".join(holding.loaded_stops)])
-        if holding.uses_friction:
+        lines += _label("motor", mechanism.actuated, static.tau, motor_units(mechanism))
+        if static.reason:
+            lines.append(["not held", static.reason])
+            lines += _label("remains along", names, static.missing, units)
+        if static.loaded_stops:
+            lines.append(["stops that hold it", ", ".join(static.loaded_stops)])
+        if static.uses_friction:
             lines.append(["dry friction", "holds a part of it"])
         return lines
 
@@ -102,7 +102,7 @@ class Forces(Quantity):
         lines += [[f"joint {name}", _format_wrench(joints[name])] for name in largest]
         if len(joints) > MAX_JOINT_LINES:
             lines.append(["", f"and {len(joints) - MAX_JOINT_LINES} joints with smaller forces"])
-        if state.v_tree is None and state.holding.reason:
+        if state.v_tree is None and state.static_forces.reason:
             lines.append(["not held", "what remains acts along the independent coordinates"])
         if state.v_tree is not None and (self.mechanism.joints.friction.any() or self.mechanism.joints.stopped.any()):
             lines.append(["left out", "stops, and dry friction of joints that stick"])
@@ -148,9 +148,9 @@ def compute_pose_forces(state: PoseState) -> tuple[dict[str, Array], dict[str, A
     """
     mechanism, wrenches = state.mechanism, state.link_wrenches
     if state.v_tree is None:
-        terms, tau = state.rest, state.holding.tau
-        other_force = state.holding.passive_force.copy()
-        other_force[state.at.partition.q] += state.holding.missing
+        terms, tau = state.rest, state.static_forces.tau
+        other_force = state.static_forces.passive_force.copy()
+        other_force[state.at.partition.q] += state.static_forces.missing
         acceleration = np.zeros(mechanism.n)
     else:
         terms = Terms(mechanism, state.at, state.v_tree)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
 from ckc_pin.base.validation import suggest_name
 from ckc_pin.control.actuation import DRIVE_TOLERANCE, Actuation
 from ckc_pin.errors import CkcError, InputError
@@ -84,7 +84,7 @@ class MotorRoles(Quantity):
         sizes = np.linalg.norm(rates, axis=1)
         idle = sizes < IDLE_RATIO
         active = rates[~idle] / sizes[~idle, None]
-        _, values, internal = np.linalg.svd(active.T)
+        freedoms, values, internal = np.linalg.svd(active.T)
         rank = int(np.sum(values > DRIVE_TOLERANCE * values.max(initial=0.0)))
         takes_part = np.linalg.norm(internal[rank:], axis=0) > DRIVE_TOLERANCE
         redundant = int((~idle).sum()) - rank
@@ -93,8 +93,10 @@ class MotorRoles(Quantity):
             text = f"{redundant}, of {', '.join(names[~idle][takes_part])}"
         lines = [["internal torques", text], ["idle here", ", ".join(names[idle]) or "none"]]
         if rank < mechanism.d:
-            undriven = self.actuation.find_undriven_freedoms(state.at)
-            lines.append(["freedoms without a motor", f"{mechanism.d - rank}, along {', '.join(undriven)}"])
+            undriven = (scale[:, None] * basis @ freedoms[:, rank:])[mechanism.partition.q]
+            columns = sorted(pivoted_columns(undriven.T)[0][: mechanism.d - rank])
+            text = ", ".join(mechanism.independent[k] for k in columns)
+            lines.append(["freedoms without a motor", f"{mechanism.d - rank}, along {text}"])
         return lines
 
 
@@ -135,7 +137,7 @@ class Quantities:
         ]
 
     @property
-    def shown(self) -> list[str]:
+    def visible_names(self) -> list[str]:
         """Names of the quantities that are shown."""
         return list(self._shown)
 

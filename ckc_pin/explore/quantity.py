@@ -19,7 +19,7 @@ from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.geometry import Placements
 
-__all__ = ["Holding", "PoseState", "Quantity", "ShownQuantities", "format_number"]
+__all__ = ["PoseState", "Quantity", "ShownQuantities", "StaticForces", "format_number"]
 
 DIGITS = 4
 
@@ -49,7 +49,7 @@ class ShownQuantities:
 
 
 @dataclass(frozen=True)
-class Holding:
+class StaticForces:
     """Forces that hold a pose at rest.
 
     Attributes
@@ -113,7 +113,7 @@ class PoseState:
         return compute_velocity_basis(self.rest)
 
     @lazy
-    def holding(self) -> Holding:
+    def static_forces(self) -> StaticForces:
         """Forces that hold the pose at rest."""
         mechanism, rest = self.mechanism, self.rest
         try:
@@ -121,10 +121,10 @@ class PoseState:
         except InputError as error:
             tau = closest_torques(rest, self.velocities, self.actuation)
             missing = rest.rho.T @ (rest.h_tree - mechanism.motors.force(tau))
-            return Holding(tau, np.zeros(mechanism.n), missing, str(error).removeprefix(f"{mechanism.name}: "))
+            return StaticForces(tau, np.zeros(mechanism.n), missing, str(error).removeprefix(f"{mechanism.name}: "))
         stops = tuple(mechanism.coordinates[k] for k in balance.loaded_stops)
         missing = np.zeros(len(self.at.partition.q))
-        return Holding(balance.tau, balance.passive_force, missing, "", stops, balance.uses_friction)
+        return StaticForces(balance.tau, balance.passive_force, missing, "", stops, balance.uses_friction)
 
     @lazy
     def placements(self) -> Placements:
