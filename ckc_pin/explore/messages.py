@@ -282,6 +282,11 @@ def read_request(message: str | bytes) -> Request:
 # --- to the page ---------------------------------------------------------------------------------
 
 
+def _convert_scalar(value: Any) -> float | int:
+    """Convert a scalar of NumPy, which msgspec does not know."""
+    return value.item()
+
+
 class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Base of the program's reports, which the page gets as a command {"type": "report", "path": ..., ...}.
 
@@ -291,7 +296,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     def to_command(self) -> dict[str, Any]:
         """Return the report as a command of the viewer; its path is the kind of the report, as "pose"."""
         kind = _tag(type(self).__name__.removesuffix("Report"))
-        return {"type": "report", "path": kind, "content": msgspec.to_builtins(self)}
+        return {"type": "report", "path": kind, "content": msgspec.to_builtins(self, enc_hook=_convert_scalar)}
 
 
 class CoordinateInfo(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""The explorer's page: meshcat's viewer with a panel of controls. Its HTML, CSS and JavaScript are in the folder `static`.
+"""The explorer's page: meshcat's viewer with a panel of controls. Its HTML, CSS and JavaScript are in `static`.
 
 The controls are elements of HTML, such as sliders, number fields and buttons. Browsers make them work with a keyboard,
 a touch screen and a screen reader, and nothing has to be shipped. The viewer's own panel, dat.gui, supports none of

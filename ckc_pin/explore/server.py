@@ -15,7 +15,8 @@ import msgspec
 from ckc_pin.errors import InputError
 from ckc_pin.explore.messages import FrameShown, Notice, Request, read_request
 from ckc_pin.explore.page import read_explore_script, render_explore_page
-from ckc_pin.view.server import Viewer, ViewServer
+from ckc_pin.view.commands import Command
+from ckc_pin.view.server import ViewServer
 
 __all__ = ["ExploreServer"]
 
@@ -28,8 +29,9 @@ NOTEBOOKS = "http://localhost:* http://127.0.0.1:*"  # pages that may show the e
 class ExploreServer(ViewServer):
     """A server for the explorer's page, in any number of browsers. All of them see the same scene and reports.
 
-    Send drawing commands by `send`, and reports by ``send(report.to_command())``. The newest report of each kind is kept
-    for pages that connect later. Valid requests are passed to `on_request`. Invalid ones are answered with a notice.
+    Send drawing commands by `send`, and reports by ``send(report.to_command())``. The newest report of each kind is
+    kept for pages that connect later. Valid requests are passed to `on_request`. Invalid ones are answered with a
+    notice.
 
     Parameters
     ----------
@@ -66,20 +68,18 @@ class ExploreServer(ViewServer):
             raise InputError("token: use 16 to 128 letters, digits, hyphens and underscores")
         self.on_request = on_request
         self._notices = count(1)
-        super().__init__(
-            render_explore_page(title), port, script=read_explore_script(), folder=f"/{self.token}/", ancestors=NOTEBOOKS
-        )  # fmt: skip
+        page, script = render_explore_page(title), read_explore_script()
+        super().__init__(page, port, script=script, folder=f"/{self.token}/", ancestors=NOTEBOOKS)
 
-    def receive(self, viewer: Viewer, message: str | bytes) -> None:
+    def receive(self, message: str | bytes, reply: Callable[[Command], None]) -> bool:
         """Pass a request on; answer an invalid one with a notice to its page alone."""
         try:
             request = read_request(message)
         except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
             text = f"request refused: {error}"[:MAX_NOTICE_LENGTH]
-            notice = Notice(text=text, is_error=True, serial=next(self._notices))
-            viewer.send(msgspec.msgpack.encode(notice.to_command()))
-            return
+            reply(Notice(text=text, is_error=True, serial=next(self._notices)).to_command())
+            return False
         if isinstance(request, FrameShown):
-            viewer.send_next_frame()
-        else:
-            self.on_request(request)
+            return True
+        self.on_request(request)
+        return False

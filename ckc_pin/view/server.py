@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Any
 
+import msgspec
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -21,7 +22,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.view.commands import SEVERAL, Command, SceneState
 from ckc_pin.view.page import read_live_script, read_viewer_script
 
-__all__ = ["ViewServer", "Viewer"]
+__all__ = ["ViewServer"]
 
 LOOPBACK = "127.0.0.1"
 MAX_MESSAGE_BYTES = 2**16  # from a viewer; they are a few hundred bytes long
@@ -78,9 +79,11 @@ class ViewServer:
         self.url = f"http://{LOOPBACK}:{self.port}{folder}"
         self.hosts = {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
         self.scene_state = SceneState()
-        self.viewers: set[Viewer] = set()
-        routes: list[Any] = [(folder, Viewer, {"server": self, "page": page, "ancestors": ancestors})]
-        routes += [(f"{folder}{name}", _Script, {"server": self, "content": content}) for name, content in scripts.items()]
+        self.viewers: set[_Viewer] = set()
+        routes: list[Any] = [(folder, _Viewer, {"server": self, "page": page, "ancestors": ancestors})]
+        routes += [
+            (f"{folder}{name}", _Script, {"server": self, "content": content}) for name, content in scripts.items()
+        ]
         self._application = Application(
             routes,
             default_handler_class=_NotFound,
@@ -149,11 +152,14 @@ class ViewServer:
                 viewer.next_frame = None
             viewer.send(message)
 
-    def receive(self, viewer: Viewer, message: str | bytes) -> None:
-        """Handle a message of a viewer. A playback page's only message says that it has shown the last frame."""
-        viewer.send_next_frame()
+    def receive(self, message: str | bytes, reply: Callable[[Command], None]) -> bool:
+        """Handle a viewer's message; return whether the viewer has shown the last frame.
 
-    def add_viewer(self, viewer: Viewer) -> None:
+        Every message of a playback page says that. `reply` sends a command to this viewer alone.
+        """
+        return True
+
+    def add_viewer(self, viewer: _Viewer) -> None:
         """Send the current scene to a new viewer, and all later commands too."""
         with self._scene_lock:
             messages = self.scene_state.messages()
@@ -224,7 +230,7 @@ class _Script(_SameOriginHandler):
         self.write(self.content)
 
 
-class Viewer(_SameOriginHandler, WebSocketHandler):
+class _Viewer(_SameOriginHandler, WebSocketHandler):
     """The page, and the WebSocket that the page opens at the same address."""
 
     def initialize(self, server: ViewServer, page: str = "", ancestors: str = "", **rest: Any) -> None:
@@ -266,13 +272,15 @@ class Viewer(_SameOriginHandler, WebSocketHandler):
         self.send(message)
 
     def on_message(self, message: str | bytes) -> None:
-        self.server.receive(self, message)
-
-    def send_next_frame(self) -> None:
-        """Send the waiting frame, because the previous one has been shown."""
+        """Handle a message. If the last frame has been shown, send the waiting one."""
+        if not self.server.receive(message, self.reply):
+            return
         self.is_busy, next_frame, self.next_frame = False, self.next_frame, None
         if next_frame is not None:
             self.send_frame(next_frame)
+
+    def reply(self, command: Command) -> None:
+        self.send(msgspec.msgpack.encode(command))
 
     def on_close(self) -> None:
         self.server.viewers.discard(self)

@@ -1,11 +1,13 @@
-"""A stand-in for the explorer's program: a server that draws a mechanism, sends reports and records the page's requests."""
+"""A stand-in for the explorer's program, which draws a mechanism, sends reports and records the page's requests."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import pytest
 
 import ckc_pin
 from ckc_pin.explore import messages
@@ -13,11 +15,24 @@ from ckc_pin.explore.server import ExploreServer
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.drawing import WORLD, estimate_reach, set_camera
 from ckc_pin.view.geometry import compute_placements, homogeneous
+from tests.browser.pages import Visit
 
-__all__ = ["PATIENCE", "StandIn"]
+__all__ = ["PARAMETERS", "QUANTITIES", "ROOT", "StandIn", "five_bar", "open_explorer", "program"]
 
 PATIENCE = 20.0  # s
 ROOT = f"{WORLD}/explored"
+# The last message of the start has been shown, and the picture has been drawn.
+READY = "document.getElementById('closure').textContent && !viewer.needs_render"
+QUANTITIES = [
+    messages.QuantityInfo(name="values", label="Coordinates", on=True),
+    messages.QuantityInfo(name="forces", label="Forces", on=False),
+    messages.QuantityInfo(name="reach", label="Ellipsoids", on=False, unavailable="no named points"),
+]
+PARAMETERS = [
+    messages.ParameterInfo(name=f"link.{link}.{kind}", group=f"link.{link}", unit=unit, value=value, default=1.0,
+                           lower=0.0, upper=2.0)
+    for link in ("crank", "rod") for kind, unit, value in (("mass", "kg", 1.0), ("angle", "rad", 1.5))
+]  # fmt: skip
 
 
 class StandIn:
@@ -97,3 +112,28 @@ class StandIn:
         self.requests.clear()
         assert len(taken) == count, taken
         return taken
+
+
+@pytest.fixture
+def program() -> Iterator[Callable[..., StandIn]]:
+    """Start stand-ins for the program, which are stopped at the end of the test."""
+    started: list[StandIn] = []
+
+    def start(name: str = "five_bar", **options: Any) -> StandIn:
+        started.append(StandIn(name, **options))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.server.stop()
+
+
+@pytest.fixture
+def five_bar(program) -> StandIn:
+    return program(quantities=QUANTITIES, parameters=PARAMETERS)
+
+
+def open_explorer(look_at: Callable[..., Visit], program: StandIn, **options: Any) -> Visit:
+    visit = look_at(program.server.url, READY, **options)
+    program.requests.clear()
+    return visit

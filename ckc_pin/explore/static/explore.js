@@ -5,6 +5,7 @@ var explorer = (function () {
   const NOTICE_MS = 8000;  // how long a notice is shown that is no error
 
   const MODES = {free: "torque sliders", hold: "hold targets", scene: "the scene's controller"};
+  const NO_FOLDER = "To save files, start the explorer with a folder to save into.";
 
   const waiting = new Map();  // newest message of each control, sent once per animation frame
   let connection = null;
@@ -122,7 +123,7 @@ var explorer = (function () {
     setOptions(element("formulation"), [["as in the scene: " + report.formulation, ""], ...formulations]);
     element("run-section").hidden = !report.modes.length;
     ["save-scene", "save-parameters", "save-run"].forEach((id) => { element(id).disabled = !report.can_save; });
-    setText(element("save-note"), report.can_save ? "" : "To save files, start the explorer with a folder to save into.");
+    setText(element("save-note"), report.can_save ? "" : NO_FOLDER);
     grab.setBodies(report);
     map.setUnits(Object.fromEntries(report.coordinates.map((info) => [info.name, info.unit])));
     showMotors();

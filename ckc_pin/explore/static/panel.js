@@ -5,6 +5,7 @@
 const DEGREE = Math.PI / 180;
 const SLIDER_STEPS = 1000;  // of an arrow key, in a slider's range
 const DIGITS = 6;
+const ROUNDING = 1e-9;  // of a slider's range; smaller numbers are displayed as zero
 
 let angleUnit = "rad";  // of what is displayed; messages are in rad
 
@@ -93,10 +94,11 @@ class SliderRow {
 
   setScale(info) {
     this.unit = info.unit;
+    this.range = info.upper - info.lower;
     if (!this.isHeld) {
       this.slider.min = info.lower;
       this.slider.max = info.upper;
-      this.slider.step = (info.upper - info.lower) / SLIDER_STEPS || "any";
+      this.slider.step = this.range / SLIDER_STEPS || "any";
     }
     const factor = displayFactor(info.unit), unit = displayUnit(info.unit);
     const ends = formatNumber(factor * info.lower) + " to " + formatNumber(factor * info.upper) + " " + unit;
@@ -118,7 +120,8 @@ class SliderRow {
   }
 
   display() {
-    const shown = formatNumber(displayFactor(this.unit) * this.value);
+    const value = Math.abs(this.value) < ROUNDING * this.range ? 0 : this.value;
+    const shown = formatNumber(displayFactor(this.unit) * value);
     if (!this.isHeld) { this.slider.value = this.value; }
     if (!this.isTyping && this.number.value !== shown) { this.number.value = shown; }
     this.slider.setAttribute("aria-valuetext", shown + " " + displayUnit(this.unit));
@@ -303,9 +306,8 @@ class MapCanvas {
 
   // The rectangle of the picture in the canvas, in CSS pixels.
   frame() {
-    const width = this.canvas.clientWidth;
-    const height = this.map.y ? width - 20 : 70;
-    return {left: this.map.y ? 62 : 14, top: 10, width: width - (this.map.y ? 74 : 28), height: height - 10};
+    const left = this.map.y ? 62 : 14, width = this.canvas.clientWidth - left - 14;
+    return {left: left, top: 10, width: width, height: this.map.y ? width : 50};
   }
 
   draw() {
