@@ -10,7 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from ckc_pin.explore import messages
+from ckc_pin.explorer import messages
 from tests.browser.explorer import PARAMETERS, QUANTITIES, ROOT, five_bar, open_explorer, program
 from tests.browser.pages import Visit, browser, look_at
 

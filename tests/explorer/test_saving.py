@@ -12,7 +12,7 @@ import pytest
 import ckc_pin
 from ckc_pin import InputError, Mechanism, Scene, load, load_scene, simulate
 from ckc_pin.base.toml import read_toml
-from ckc_pin.explore.saving import (
+from ckc_pin.explorer.saving import (
     python_lines,
     q_guess_text,
     save_parameters,

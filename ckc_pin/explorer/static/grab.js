@@ -199,7 +199,8 @@ var grab = (function () {
     const object = drag && findObject(bodies[drag.body]);
     if (!object) { return; }
     viewer.scene.updateMatrixWorld(true);
-    line.geometry.setFromPoints([object.localToWorld(drag.point.clone()), drag.target]);
+    const ends = [object.localToWorld(drag.point.clone()), drag.target.clone()];
+    line.geometry.setFromPoints(ends.map((point) => viewer.scene.worldToLocal(point)));  // the scene itself is turned
     line.visible = true;
     viewer.set_dirty();
   }

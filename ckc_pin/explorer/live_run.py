@@ -22,8 +22,8 @@ from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import CkcError, InputError, NumericalError
-from ckc_pin.explore.messages import RunReport
-from ckc_pin.explore.saving import scene_at, write_new_texts
+from ckc_pin.explorer.messages import RunReport
+from ckc_pin.explorer.saving import scene_at, write_new_texts
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.simulate import simulate

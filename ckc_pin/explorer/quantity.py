@@ -11,7 +11,7 @@ from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.explore.paths import SHOWN
+from ckc_pin.explorer.paths import SHOWN
 from ckc_pin.linear.statics import balance_at_rest, closest_torques, compute_velocity_basis
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from ckc_pin import InputError, Mechanism, Run, Scene, load, load_scene, simulate
-from ckc_pin.explore import live_run
-from ckc_pin.explore.live_run import MAX_FRAME_S, PUSH_DAMPING_RATIO, PUSH_FREQUENCY, LiveFrame, LiveRun, list_modes
-from ckc_pin.explore.messages import RunReport
+from ckc_pin.explorer import live_run
+from ckc_pin.explorer.live_run import MAX_FRAME_S, PUSH_DAMPING_RATIO, PUSH_FREQUENCY, LiveFrame, LiveRun, list_modes
+from ckc_pin.explorer.messages import RunReport
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.analytic.five_bar import FIVE_BAR, Array
 from tests.analytic.test_forces import generalized
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
-from tests.explore.test_saving import moved
+from tests.explorer.test_saving import moved
 
 SIX = ["five_bar", "delta", "stewart", "bricard", "two_ur5", "slider_crank"]
 BLOCK = """<robot name="block"><link name="base"/>
