@@ -6,19 +6,20 @@ a stop, where phi_z becomes singular, or where nothing comes nearer to the targe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
+from ckc_pin.errors import InputError
 from ckc_pin.kinematics.continuation import follow
 from ckc_pin.kinematics.sigma import newton, predict
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.mechanism.pose import Anchors, Pose
 
-__all__ = ["Movement", "drag_point", "move_coordinate"]
+__all__ = ["Movement", "drag_point", "move_coordinate", "move_independent"]
 
 MAX_STEP = 0.25  # rad, or mechanism sizes, of any coordinate: longest tangent step
 MIN_PIECE = 1e-7  # of a tangent step to the value of a coordinate
@@ -87,29 +88,53 @@ def move_coordinate(mechanism: Mechanism, at: Kinematics, name: str, value: floa
     k = int(tree.indices((name,), "coordinate")[0])
     if name in mechanism.prescribed:
         return Movement(at, False, f"the motion of {name} is prescribed")
+    if k in mechanism.partition.q and not mechanism.splits_root:
+        return move_independent(mechanism, at, {name: value}, max_steps)
     clipped = float(np.clip(value, mechanism.joints.lower[k], mechanism.joints.upper[k]))
+    movement = _approach(
+        mechanism,
+        at,
+        lambda x: np.array([clipped - tree.to_coordinates(x.q_tree)[k]]),
+        lambda x: _coordinate_rate(x, k),
+        REACHED_TOLERANCE * float(tree.step_scale[k]),
+        max_steps,
+        SINGULAR_MARGIN,
+        f"{name} cannot go any further on this branch",
+    )
+    if movement.reached and clipped != value:
+        return Movement(movement.at, False, _describe_stop(mechanism, k, clipped < value))
+    return movement
+
+
+def move_independent(
+    mechanism: Mechanism, at: Kinematics, values: Mapping[str, float], max_steps: int = 100
+) -> Movement:
+    """Move independent coordinates to values, on a straight line in q; see `move_coordinate`.
+
+    Raises
+    ------
+    InputError
+        A coordinate is not independent.
+    """
+    mechanism.vector(values, mechanism.independent, "q", fill=0.0)
+    if mechanism.splits_root:
+        raise InputError(f"{mechanism.name}: {CONSTRAINED_IN_PART}")
+    tree, joints = mechanism.tree, mechanism.joints
+    ks = [tree.index[name] for name in values]
+    clipped = np.clip(list(values.values()), joints.lower[ks], joints.upper[ks])
 
     def remaining(configuration: Kinematics) -> Array:
         numbers = tree.to_coordinates(configuration.q_tree)
-        numbers[k] = clipped
+        numbers[ks] = clipped
         return tree.difference(configuration.q_tree, tree.from_coordinates(numbers))
 
-    tolerance = REACHED_TOLERANCE * float(tree.step_scale[k])
-    if k in mechanism.partition.q and not mechanism.splits_root:
-        movement = _follow_coordinate(mechanism, at, remaining, tolerance, max_steps)
-    else:
-        movement = _approach(
-            mechanism,
-            at,
-            lambda x: np.array([clipped - tree.to_coordinates(x.q_tree)[k]]),
-            lambda x: _coordinate_rate(x, k),
-            tolerance,
-            max_steps,
-            SINGULAR_MARGIN,
-            f"{name} cannot go any further on this branch",
+    movement = _follow_q(mechanism, at, remaining, max_steps)
+    beyond = [k for k, value, stop in zip(ks, values.values(), clipped, strict=True) if value != stop]
+    if movement.reached and beyond:
+        k = beyond[0]
+        return Movement(
+            movement.at, False, _describe_stop(mechanism, k, values[mechanism.coordinates[k]] > joints.upper[k])
         )
-    if movement.reached and clipped != value:
-        return Movement(movement.at, False, _describe_stop(mechanism, k, clipped < value))
     return movement
 
 
@@ -168,21 +193,21 @@ def drag_point(
 # --- the two ways to move ------------------------------------------------------------------------
 
 
-def _follow_coordinate(
-    mechanism: Mechanism, at: Kinematics, remaining: Callable[[Kinematics], Array], tolerance: float, max_steps: int
+def _follow_q(
+    mechanism: Mechanism, at: Kinematics, remaining: Callable[[Kinematics], Array], max_steps: int
 ) -> Movement:
-    """Follow the straight line in q to the value of an independent coordinate."""
+    """Follow the straight line in q to a target; `remaining` returns the tangent vector (n,) to it."""
     q, tree = mechanism.partition.q, mechanism.tree
-    for _ in range(max_steps):
+    for _ in range(max_steps + 1):
         dq = remaining(at)[q]
-        if np.abs(dq).max() <= tolerance:
+        if np.all(np.abs(dq) <= REACHED_TOLERANCE * tree.step_scale[q]):
             return Movement(at, True)
         step = np.asarray(at.rho @ dq)
         longest = float(tree.step_size(step))
         at, done, end = _take_step(mechanism, at, step * min(1.0, MAX_STEP / longest), MIN_PIECE, SINGULAR_MARGIN)
         if done < 1.0:
             return Movement(at, False, end)
-    return Movement(at, bool(np.abs(remaining(at)[q]).max() <= tolerance))
+    return Movement(at, False)
 
 
 def _approach(
