@@ -21,6 +21,8 @@ from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
 __all__ = ["NearestSingularity"]
 
+MIN_GAP_RATIO = 0.01  # of the distance: coordinates that differ less are not listed
+
 
 class NearestSingularity(Quantity):
     """The singular configuration of phi_z that is nearest in all of q, on the present branch.
@@ -66,8 +68,10 @@ class NearestSingularity(Quantity):
         mechanism = self.mechanism
         units = [mechanism.tree.units()[k] for k in mechanism.partition.q]
         place = format_quantities(mechanism.independent, result.q, units, DIGITS)
-        return [["distance", f"{format_number(result.distance, result.unit)} ({result.kind}){age}"],
-                ["at", ", ".join(place)]]  # fmt: skip
+        gaps = np.abs(result.q - result.q_d)
+        text = ", ".join(place[k] for k in np.flatnonzero(gaps > MIN_GAP_RATIO * result.distance))
+        distance = f"{format_number(result.distance, result.unit)} ({result.kind}){age}"
+        return [["distance", distance], ["at", text]]
 
     def remove(self) -> list[dict[str, object]]:
         """End the thread; there is no drawing."""
