@@ -14,7 +14,7 @@ from ckc_pin.base.summary import format_quantities
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import CkcError
 from ckc_pin.explore.background import NewestTask
-from ckc_pin.explore.quantity import DIGITS, PoseState, Quantity, ShownQuantities, format_number
+from ckc_pin.explore.quantity import DIGITS, LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.kinematics.mapped import NearestSingular
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
@@ -24,7 +24,7 @@ __all__ = ["NearestSingularity"]
 MIN_GAP_RATIO = 0.01  # of the distance: coordinates that differ less are not listed
 
 
-class NearestSingularity(Quantity):
+class NearestSingularity(LiveQuantity):
     """The singular configuration of phi_z that is nearest in all of q, on the present branch.
 
     Attributes
