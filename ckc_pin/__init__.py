@@ -275,12 +275,15 @@ def singularity_map(
     over: Sequence[str] | None = None,
     point: str | None = None,
     cells: int = 200,
+    loci: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> SingularityMap:
     """Compute the workspace and the singular configurations of a mechanism: `ckc_pin.analysis.map.singularity_map`."""
     from ckc_pin.analysis.map import singularity_map as compute
 
-    return compute(mechanism, scene=scene, space=space, over=over, point=point, cells=cells, progress=progress)
+    return compute(
+        mechanism, scene=scene, space=space, over=over, point=point, cells=cells, loci=loci, progress=progress
+    )
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:

@@ -12,7 +12,7 @@ from ckc_pin.control.forces import generalized_force
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.explorer.quantity import PoseState, Quantity, ShownQuantities, format_number
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import effort, motor_units
 from ckc_pin.view.arrows import (
@@ -34,7 +34,7 @@ ARROW_OPACITY = 0.85
 MIN_FORCE = 1e-9  # N or N m: smaller ones set no scale
 
 
-class HoldingTorques(Quantity):
+class HoldingTorques(LiveQuantity):
     """Motor torques that hold the pose at rest, and h of eq. 6."""
 
     name, label = "holding_torques", "torques that hold this pose"
@@ -65,7 +65,7 @@ class HoldingTorques(Quantity):
         return lines
 
 
-class Forces(Quantity):
+class Forces(LiveQuantity):
     """Forces of loops and joints, and motor torques, as arrows."""
 
     name, label = "forces", "forces of loops and joints"

@@ -430,6 +430,8 @@ class MapImage(Report, frozen=True, kw_only=True):
         Coordinates of the axes; y is "" for a mechanism of one freedom.
     x_range, y_range
         rad or m.
+    x_turns, y_turns
+        Whether the axis is a full turn, so that the place of a point is found modulo 2 pi.
     image
         PNG as base64, its rows from the upper end of y downwards.
     note
@@ -440,6 +442,8 @@ class MapImage(Report, frozen=True, kw_only=True):
     y: str = ""
     x_range: list[float] = []
     y_range: list[float] = []
+    x_turns: bool = False
+    y_turns: bool = False
     image: str = ""
     note: str = ""
 

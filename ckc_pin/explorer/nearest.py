@@ -14,15 +14,17 @@ from ckc_pin.base.summary import format_quantities
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import CkcError
 from ckc_pin.explorer.background import NewestTask
-from ckc_pin.explorer.quantity import DIGITS, PoseState, Quantity, ShownQuantities, format_number
+from ckc_pin.explorer.quantity import DIGITS, LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.kinematics.mapped import NearestSingular
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
 __all__ = ["NearestSingularity"]
 
+MIN_GAP_RATIO = 0.01  # of the distance: coordinates that differ less are not listed
 
-class NearestSingularity(Quantity):
+
+class NearestSingularity(LiveQuantity):
     """The singular configuration of phi_z that is nearest in all of q, on the present branch.
 
     Attributes
@@ -66,8 +68,10 @@ class NearestSingularity(Quantity):
         mechanism = self.mechanism
         units = [mechanism.tree.units()[k] for k in mechanism.partition.q]
         place = format_quantities(mechanism.independent, result.q, units, DIGITS)
-        return [["distance", f"{format_number(result.distance, result.unit)} ({result.kind}){age}"],
-                ["at", ", ".join(place)]]  # fmt: skip
+        gaps = np.abs(result.q - result.q_d)
+        text = ", ".join(place[k] for k in np.flatnonzero(gaps > MIN_GAP_RATIO * result.distance))
+        distance = f"{format_number(result.distance, result.unit)} ({result.kind}){age}"
+        return [["distance", distance], ["at", text]]
 
     def remove(self) -> list[dict[str, object]]:
         """End the thread; there is no drawing."""

@@ -14,7 +14,7 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.explorer.forces import Forces, HoldingTorques
 from ckc_pin.explorer.messages import QuantityInfo
 from ckc_pin.explorer.nearest import NearestSingularity
-from ckc_pin.explorer.quantity import PoseState, Quantity, ShownQuantities, format_number
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.explorer.shapes import CentreOfMass, Ellipsoids, LoopFrames, Traces
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -28,7 +28,7 @@ __all__ = ["Conditioning", "MotorRoles", "Quantities", "ShownQuantities", "compu
 IDLE_RATIO = 1e-3  # of a motor's rate to that of its joints alone: below it the motor moves nothing
 
 
-class Conditioning(Quantity):
+class Conditioning(LiveQuantity):
     """How far phi_z and J are from losing rank."""
 
     name, label = "conditioning", "how far from singular"
@@ -63,7 +63,7 @@ def compute_margins(mechanism: Mechanism, at: Kinematics) -> dict[str, float]:
     return {"sigma_min(phi_z)": at.margin(), "sigma_min(J)": smallest}
 
 
-class MotorRoles(Quantity):
+class MotorRoles(LiveQuantity):
     """Which motors are redundant, and which move nothing at this pose."""
 
     name, label = "motors", "redundant and idle motors"
@@ -100,7 +100,7 @@ class MotorRoles(Quantity):
         return lines
 
 
-QUANTITIES: tuple[type[Quantity], ...] = (
+QUANTITIES: tuple[type[LiveQuantity], ...] = (
     Conditioning, NearestSingularity, MotorRoles, HoldingTorques, Forces, Ellipsoids, Traces, CentreOfMass, LoopFrames,
 )  # fmt: skip
 
@@ -124,7 +124,7 @@ class Quantities:
         self.actuation = Actuation(mechanism) if scene is None else build_scene_actuation(scene, mechanism)
         self._quantities = {kind.name: kind(mechanism, self.actuation) for kind in QUANTITIES}
         self._unavailable = {name: one.explain_unavailable() for name, one in self._quantities.items()}
-        self._shown: dict[str, Quantity] = {}
+        self._shown: dict[str, LiveQuantity] = {}
         nearest = self._quantities[NearestSingularity.name]
         assert isinstance(nearest, NearestSingularity)
         nearest.on_update = on_update

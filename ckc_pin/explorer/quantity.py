@@ -19,7 +19,7 @@ from ckc_pin.view import commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.geometry import Placements
 
-__all__ = ["PoseState", "Quantity", "ShownQuantities", "StaticForces", "format_number"]
+__all__ = ["LiveQuantity", "PoseState", "ShownQuantities", "StaticForces", "format_number"]
 
 DIGITS = 4
 
@@ -141,7 +141,7 @@ class PoseState:
         }
 
 
-class Quantity:
+class LiveQuantity:
     """A quantity that can be shown: lines of text, bars, and a drawing.
 
     Parameters

@@ -12,7 +12,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import NumericalError
 from ckc_pin.explorer.paths import EXPLORED
-from ckc_pin.explorer.quantity import PoseState, Quantity, ShownQuantities, format_number
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined
@@ -40,7 +40,7 @@ TRACE_LENGTH = 2000  # positions of a point
 CHUNK_LENGTH = 100  # positions in one line; only the last line is sent again
 
 
-class Ellipsoids(Quantity):
+class Ellipsoids(LiveQuantity):
     """Manipulability ellipsoids of the named points: their velocities while the motors' rates have norm one."""
 
     name, label = "ellipsoids", "manipulability ellipsoids of points"
@@ -124,7 +124,7 @@ def _input_unit(mechanism: Mechanism) -> str:
     return f"{joined(units[mechanism.partition.q].tolist())} of q"
 
 
-class Traces(Quantity):
+class Traces(LiveQuantity):
     """Paths of the named points while they are shown."""
 
     name, label = "traces", "traces of points"
@@ -161,7 +161,7 @@ class Traces(Quantity):
         return lines
 
 
-class CentreOfMass(Quantity):
+class CentreOfMass(LiveQuantity):
     """The centre of mass of all moving bodies."""
 
     name, label = "centre_of_mass", "centre of mass"
@@ -187,7 +187,7 @@ class CentreOfMass(Quantity):
         return sum(float(inertia.mass) for inertia in list(self.mechanism.tree.model.inertias)[1:])
 
 
-class LoopFrames(Quantity):
+class LoopFrames(LiveQuantity):
     """Both frames of each loop, and a rod across each loop that is open."""
 
     name, label = "loop_frames", "frames of loops"

@@ -214,7 +214,7 @@ def test_holding_torques_are_the_gradient_of_the_energy_along_the_manifold() -> 
         assert "not held" not in lines
 
 
-def test_pendulum_without_motor_is_not_held_and_its_moment_remains() -> None:
+def test_moment_of_pendulum_without_motor_remains() -> None:
     mechanism = Mechanism.from_urdf(PENDULUM, actuated=[])
     angle = 0.3
     lines = dict(show(mechanism, "holding_torques").evaluate(mechanism.kinematics(np.array([angle])))
