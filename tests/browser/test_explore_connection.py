@@ -69,6 +69,7 @@ def test_page_works_in_a_frame_of_a_notebook(look_at, five_bar, tmp_path):
     cell = (
         f"<!DOCTYPE html><script>viewer = 'none here'</script><iframe src={five_bar.server.url} width=900 height=500>"
     )
+    (tmp_path / "favicon.ico").touch()
     (tmp_path / "cell.html").write_text(cell)
     notebook = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=tmp_path))
     Thread(target=notebook.serve_forever, daemon=True).start()

@@ -36,13 +36,13 @@ class View:
     def project(self, point: np.ndarray) -> tuple[float, float]:
         clip = self.to_clip @ [*point, 1.0]
         x, y = clip[:2] / clip[3]
-        left, top, width, height = self.box
-        return left + (x + 1) / 2 * width, top + (1 - y) / 2 * height
+        x_0, y_0, width, height = self.box
+        return x_0 + (x + 1) / 2 * width, y_0 + (1 - y) / 2 * height
 
     def ray(self, x: float, y: float) -> np.ndarray:
         """Return the direction of the ray from the eye through a place of the window."""
-        left, top, width, height = self.box
-        far = np.linalg.solve(self.to_clip, [2 * (x - left) / width - 1, 1 - 2 * (y - top) / height, 1.0, 1.0])
+        x_0, y_0, width, height = self.box
+        far = np.linalg.solve(self.to_clip, [2 * (x - x_0) / width - 1, 1 - 2 * (y - y_0) / height, 1.0, 1.0])
         direction = far[:3] / far[3] - self.eye
         return direction / np.linalg.norm(direction)
 

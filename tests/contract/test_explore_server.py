@@ -264,7 +264,9 @@ def test_oversized_message_closes_the_connection(serve_explorer, caplog):
         notice = await receive(connection)
         assert notice["path"] == "notice"
         await connection.write_message("x" * (MAX_MESSAGE_BYTES + 1))
-        return await receive(connection), connection.close_code
+        end = await receive(connection), connection.close_code
+        connection.close()
+        return end
 
     assert asyncio.run(talk()) == (None, 1009)
     assert recorder.requests == []
