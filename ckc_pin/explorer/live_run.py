@@ -92,14 +92,14 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Input:
-    """What acts from a time on: wrenches by joint that are not zero, and motor torques in mode "free"."""
+    """Wrenches by joint, without those that are zero, and motor torques of mode "free", from a time on."""
 
     t: float
     wrenches: dict[str, Array]
     tau: Array
 
     def equals(self, other: _Input) -> bool:
-        """Whether the same acts, at another time."""
+        """Whether wrenches and torques are equal, at another time."""
         return (
             self.wrenches.keys() == other.wrenches.keys()
             and all(np.array_equal(x, other.wrenches[name]) for name, x in self.wrenches.items())
@@ -406,13 +406,13 @@ class LiveRun:
         try:
             if must_restore:
                 self._restore()
-            frame, given, moved = self._make_step(pull, tau, target)
+            frame, step_input, moved = self._make_step(pull, tau, target)
         except NumericalError as error:
             reason = str(error)
         except Exception as error:  # of a controller, event or force that is a function of the caller's
             reason = f"{type(error).__name__}: {error}"
         else:
-            duration = self._store(frame, given, moved)
+            duration = self._store(frame, step_input, moved)
             if duration > (1 - EVENT_TOLERANCE) * self._frame_duration or not duration:
                 return duration
             reason = f"event {self._simulator.events[-1]['name']}"
@@ -421,7 +421,7 @@ class LiveRun:
         return 0.0
 
     def _make_step(self, pull: _Push | None, tau: Array, target: Array) -> tuple[_Frame, _Input, bool]:
-        """Make a step and return its frame, what acted in it, and whether the targets moved."""
+        """Make a step and return its frame, its inputs, and whether the targets moved."""
         simulator, state = self._simulator, self._simulator.state
         wrench, push = self._compute_wrench(pull, state) if pull else (None, None)
         acting = {} if pull is None or wrench is None else {pull.name: wrench}
@@ -440,16 +440,18 @@ class LiveRun:
         number = self._frames[-1].number + 1
         return _Frame(number, reached, simulator.tau, push, desired), _Input(state.t, acting, tau), moved
 
-    def _store(self, frame: _Frame, given: _Input, moved: bool) -> float:
+    def _store(self, frame: _Frame, step_input: _Input, moved: bool) -> float:
         """Store a frame and return its duration, s: 0 if the run has been rewound in the meantime."""
         with self._change:
             if self._must_restore:
                 return 0.0
-            if not given.equals(self._inputs[-1]):
-                self._inputs[-1:] = [given] if given.t == self._inputs[-1].t else [self._inputs[-1], given]
+            if not step_input.equals(self._inputs[-1]):
+                self._inputs[-1:] = (
+                    [step_input] if step_input.t == self._inputs[-1].t else [self._inputs[-1], step_input]
+                )
             if moved:
-                if self._knots[-1][0] < given.t:
-                    self._knots.append((given.t, self._desired))
+                if self._knots[-1][0] < step_input.t:
+                    self._knots.append((step_input.t, self._desired))
                 self._knots.append((frame.state.t, frame.desired))
             self._desired = frame.desired
             follows, t_shown = self._shown == len(self._frames) - 1, self._times[self._shown]
@@ -466,7 +468,7 @@ class LiveRun:
             self._reached.append((now, frame.state.t))
             while now - self._reached[0][0] > RATE_WINDOW_S and len(self._reached) > 2:
                 self._reached.popleft()
-            return frame.state.t - given.t
+            return frame.state.t - step_input.t
 
     def _restore(self) -> None:
         """Set the simulator to the last stored frame."""
@@ -560,7 +562,7 @@ class LiveRun:
         return place / file, message
 
     def _describe(self, inputs: list[_Input], knots: list[tuple[float, Array]], t_end: float) -> Scene:
-        """Return the scene of what acted up to a time."""
+        """Return the scene of the inputs up to a time."""
         mechanism = self.mechanism
         overrides: dict[str, Any] = {"t_end": t_end, "solver.output_dt": MAX_FRAME_S}
         times = [one.t for one in inputs]

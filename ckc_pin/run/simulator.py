@@ -158,6 +158,8 @@ class Simulator(HasSummary):
     def tau(self) -> Array:
         """Motor torques at the present state, shape (motors,), N m or N.
 
+        Those of a sampled controller are zero until the first step.
+
         Raises
         ------
         NumericalError
@@ -184,9 +186,9 @@ class Simulator(HasSummary):
     def reset(self, state: State | Mapping[str, Any] | None = None) -> State:
         """Go to a state. Earlier steps have no influence on the following ones.
 
-        Forces that `step` has set return to the scene's values. An acting controller begins anew: integrals are zero,
-        desired motions are the scene's, and a sampled controller samples the state at once, as if it were that of the
-        last sample instant.
+        Forces that `step` has set return to the scene's values. An acting controller restarts: integrals are zero,
+        desired motions are the scene's, and a sampled controller samples the state when the next step begins, as if it
+        were that of the last sample instant.
 
         Parameters
         ----------
