@@ -106,6 +106,8 @@ class NearestSingularity(LiveQuantity):
                 result = find_nearest_singular(mechanism, lambda t: rest, np.zeros(1))
         except CkcError as error:
             result = str(error)
+        if self._task is None:  # hidden in the meantime
+            return
         self._result = (q_tree, time, result)
         if self.on_update is not None:
             self.on_update()

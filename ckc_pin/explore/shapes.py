@@ -13,6 +13,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import NumericalError
 from ckc_pin.explore.paths import EXPLORED
 from ckc_pin.explore.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.kinematics.sigma import SINGULAR_MARGIN
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined
@@ -100,7 +101,7 @@ def compute_ellipsoids(mechanism: Mechanism, at: Kinematics) -> dict[str, Array]
     NumericalError
         phi_z is singular, or the motors' rates do not determine the motion.
     """
-    if at.phi_z_factor.singular:
+    if at.margin() <= SINGULAR_MARGIN:
         raise NumericalError("phi_z is singular here, so q_dot does not determine the velocities")
     to_velocity = at.rho
     if _has_rates_of_motors(mechanism):

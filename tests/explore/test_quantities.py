@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 
 import ckc_pin
 from ckc_pin import InputError, Mechanism
+from ckc_pin.analysis.singularities import search_singular
 from ckc_pin.explore.forces import compute_pose_forces
 from ckc_pin.explore.paths import EXPLORED, SHOWN
 from ckc_pin.explore.quantities import QUANTITIES, Quantities
@@ -112,6 +113,21 @@ def test_quantity_that_does_not_exist_at_a_pose_says_why() -> None:
     assert lines["ellipsoids"][0][0] == "not here"
     assert "phi_z is singular" in lines["ellipsoids"][0][1]
     assert lines["centre_of_mass"][0][0] == "x"
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta", "bricard"])
+def test_singular_poses_give_texts_and_finite_drawings(name: str) -> None:
+    mechanism = ckc_pin.load(name)
+    names = [info.name for info in Quantities(mechanism).infos() if not info.unavailable]
+    quantities = show(mechanism, *(name for name in names if name != "nearest_singular"))
+    points = search_singular(mechanism, 6)
+    assert points
+    for point in points:
+        shown = quantities.evaluate(point.at)
+        texts = [text for lines in shown.lines.values() for line in lines for text in line]
+        assert any("singular here" in text for text in texts)
+        assert not any("nan" in text or "e+1" in text for text in texts)
+        assert all(np.isfinite(command["matrix"]).all() for command in shown.commands if "matrix" in command)
 
 
 # --- conditioning and motors ---------------------------------------------------------------------
