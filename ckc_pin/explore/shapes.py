@@ -84,7 +84,8 @@ class Ellipsoids(LiveQuantity):
                 commands.set_transform(self._path(name), homogeneous(axes * drawn, state.points[name]))
             )
             texts = ", ".join(format_number(x) for x in np.where(semi_axes < 1e-12, 0.0, semi_axes))
-            lines.append([name, f"{texts} m/s at 1 {unit}"])
+            note = "; drawn shorter" if self.scale * semi_axes[0] > MAX_SEMI_AXIS * size else ""
+            lines.append([name, f"{texts} m/s at 1 {unit}{note}"])
         return [*lines, ["drawn at", f"{format_number(self.scale)} m for 1 m/s"]]
 
     def _path(self, point: str) -> str:

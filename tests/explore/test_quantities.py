@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -207,6 +208,18 @@ def test_distance_to_the_nearest_singular_configuration_of_five_bar() -> None:
     stale = quantities.evaluate(mechanism.kinematics(FIVE_BAR.sigma(q + 0.1))).lines["nearest_singular"]
     assert stale[0][1].endswith("s ago")
     quantities.show("nearest_singular", False)
+
+
+def test_long_search_is_given_up_when_it_is_hidden() -> None:
+    mechanism = ckc_pin.load("stewart")  # its search takes many seconds
+    quantities, others = show(mechanism, "nearest_singular"), set(threading.enumerate())
+    quantities.evaluate(mechanism.assembled)
+    (thread,) = set(threading.enumerate()) - others
+    time.sleep(0.5)
+    assert thread.is_alive()
+    quantities.show("nearest_singular", False)
+    thread.join(30)
+    assert not thread.is_alive()
 
 
 # --- holding torques and forces ------------------------------------------------------------------
