@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
@@ -24,7 +25,7 @@ from ckc_pin.mechanism.rank import count_freedoms
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.warnings import find_model_warnings
 
-__all__ = ["assemble_mechanism", "reassemble"]
+__all__ = ["assemble_mechanism", "open_loops", "reassemble"]
 
 
 def assemble_mechanism(
@@ -62,6 +63,27 @@ def assemble_mechanism(
             mechanism.warnings.append(f"the loops leave no freedom (d = 0): {locking}")
         mechanism.warnings += find_model_warnings(mechanism)
         return mechanism
+
+
+def open_loops(spec: MechanismSpec, sources: Sources, q_tree: Mapping[str, float]) -> tuple[Mechanism, Mechanism]:
+    """Return a mechanism whose loops cannot be closed: as a tree without its loops, and with open loops.
+
+    The first can be moved like any mechanism. The second is for display only: its terms exist, but its loops are open.
+
+    Parameters
+    ----------
+    spec, sources : MechanismSpec, Sources
+    q_tree : mapping
+        Where both stand, by coordinate, such as `MechanismError.q_tree`.
+    """
+    spec = msgspec.structs.replace(spec, independent=None, q_guess=dict(q_tree))
+    as_tree = assemble_mechanism(msgspec.structs.replace(spec, loop=[], coupling=[]), sources)
+    linkage = Linkage(spec, sources, None)
+    residuals = linkage.closure.largest_residuals(linkage.closure.phi(Pose(linkage.tree, linkage.closure.anchors,
+                                                                           as_tree.q_tree)))  # fmt: skip
+    with one_blas_thread():
+        opened = _create_mechanism(linkage, Assembly(as_tree.q_tree, max(residuals.values(), default=0.0), residuals))
+    return as_tree, opened
 
 
 def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tuple[Mechanism, Kinematics]:
@@ -251,7 +273,8 @@ def _assemble(linkage: Linkage, start: Array) -> Assembly:
     scale = linkage.size
     closed = _close_near(linkage, start)
     if closed.residual > ROUNDED_TOLERANCE * scale:
-        raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}")
+        nearest = linkage.tree.named(linkage.tree.to_coordinates(closed.q_tree))
+        raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}", q_tree=nearest)
     reversed_ = linkage.closure.reversed_hinges(Pose(linkage.tree, linkage.closure.anchors, closed.q_tree))
     if reversed_:
         raise MechanismError(

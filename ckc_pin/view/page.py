@@ -42,7 +42,7 @@ def render_saved_page(title: str, lines: Sequence[str], drawing: Sequence[Comman
     InputError
         meshcat is not installed.
     """
-    viewer, start = read_viewer_script().decode(), _read_static("player.js") + _read_static("saved.js")
+    viewer, start = read_viewer_script().decode(), _read_player("saved.js")
     data = b64encode(pack_scene(drawing)).decode()
     scripts = "\n".join(
         [
@@ -83,7 +83,7 @@ def pack_scene(drawing: Sequence[Command]) -> bytes:
 
 def read_live_script() -> str:
     """Return the script of a page that a server sends."""
-    return _read_static("player.js") + _read_static("live.js")
+    return _read_player("live.js")
 
 
 def read_viewer_script() -> bytes:
@@ -95,6 +95,10 @@ def read_viewer_script() -> bytes:
         meshcat is not installed.
     """
     return (_find_viewer_folder() / "dist" / "main.min.js").read_bytes()
+
+
+def _read_player(start: str) -> str:
+    return "".join(map(_read_static, ("viewer.js", "player.js", start)))
 
 
 def _read_static(name: str) -> str:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Callable, Mapping
 from threading import Event, Lock, Thread
 from types import TracebackType
 from typing import Any
 
+import msgspec
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -23,13 +25,13 @@ from ckc_pin.view.page import read_live_script, read_viewer_script
 __all__ = ["ViewServer"]
 
 LOOPBACK = "127.0.0.1"
-MAX_MESSAGE_BYTES = 2**16  # from a viewer; they are a few bytes long
+MAX_MESSAGE_BYTES = 2**16  # from a viewer; they are a few hundred bytes long
 CLOSING_TIMEOUT_S = 0.5  # for a viewer to answer the closing handshake
 
 # The page loads from, and sends to, this server only. Inline styles are allowed because dat.gui creates a style sheet.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self' ws://{host}; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    "connect-src 'self' ws://{host}; frame-ancestors {ancestors}; base-uri 'none'; form-action 'none'"
 )
 
 
@@ -39,9 +41,15 @@ class ViewServer:
     Parameters
     ----------
     page : str
-        The HTML at ``/``.
+        The HTML at ``folder``.
     port : int
         0: any free port.
+    script : str, optional
+        The script of the page, ``start.js``; the default is that of playback.
+    folder : str
+        Path below which everything is served. Nothing exists outside of it.
+    ancestors : str
+        Pages that may show this one in a frame, as in the header Content-Security-Policy.
 
     Raises
     ------
@@ -59,18 +67,23 @@ class ViewServer:
     ...     server.send(set_property("/Axes", "visible", False))
     """
 
-    def __init__(self, page: str, port: int = 0) -> None:
+    def __init__(
+        self, page: str, port: int = 0, *, script: str | None = None, folder: str = "/", ancestors: str = "'none'"
+    ) -> None:
         if not 0 <= port <= 65535:
             raise InputError(f"port {port}: choose one from 1 to 65535, or 0 for any free one")
-        scripts = {"main.min.js": read_viewer_script(), "start.js": read_live_script()}
+        start = read_live_script() if script is None else script
+        scripts: Mapping[str, bytes | str] = {"main.min.js": read_viewer_script(), "start.js": start}
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
-        self.url = f"http://{LOOPBACK}:{self.port}/"
+        self.url = f"http://{LOOPBACK}:{self.port}{folder}"
         self.hosts = {f"{name}:{self.port}" for name in (LOOPBACK, "localhost")}
         self.scene_state = SceneState()
         self.viewers: set[_Viewer] = set()
-        routes: list[Any] = [("/", _Viewer, {"server": self, "page": page})]
-        routes += [(f"/{name}", _Script, {"server": self, "content": content}) for name, content in scripts.items()]
+        routes: list[Any] = [(folder, _Viewer, {"server": self, "page": page, "ancestors": ancestors})]
+        routes += [
+            (f"{folder}{name}", _Script, {"server": self, "content": content}) for name, content in scripts.items()
+        ]
         self._application = Application(
             routes,
             default_handler_class=_NotFound,
@@ -138,6 +151,13 @@ class ViewServer:
             if kind == "delete":  # A waiting frame would draw the deleted objects again.
                 viewer.next_frame = None
             viewer.send(message)
+
+    def receive(self, message: str | bytes, reply: Callable[[Command], None]) -> bool:
+        """Handle a viewer's message; return whether the viewer has shown the last frame.
+
+        Every message of a playback page says that. `reply` sends a command to this viewer alone.
+        """
+        return True
 
     def add_viewer(self, viewer: _Viewer) -> None:
         """Send the current scene to a new viewer, and all later commands too."""
@@ -211,11 +231,12 @@ class _Script(_SameOriginHandler):
 
 
 class _Viewer(_SameOriginHandler, WebSocketHandler):
-    """The page at ``/``, and the WebSocket that the page opens at the same address."""
+    """The page, and the WebSocket that the page opens at the same address."""
 
-    def initialize(self, server: ViewServer, page: str = "", **rest: Any) -> None:
+    def initialize(self, server: ViewServer, page: str = "", ancestors: str = "", **rest: Any) -> None:
         super().initialize(server)
         self.page = page
+        self.ancestors = ancestors
         self.closed = asyncio.Event()
         self.is_busy = False  # has not yet answered that it has shown the last frame
         self.next_frame: bytes | None = None  # sent after that answer
@@ -225,7 +246,8 @@ class _Viewer(_SameOriginHandler, WebSocketHandler):
             await super().get(*args, **kwargs)
             return
         self.set_header("Content-Type", "text/html; charset=utf-8")
-        self.set_header("Content-Security-Policy", POLICY.format(host=self.request.headers["Host"]))
+        policy = POLICY.format(host=self.request.headers["Host"], ancestors=self.ancestors)
+        self.set_header("Content-Security-Policy", policy)
         self.finish(self.page)
 
     def check_origin(self, origin: str) -> bool:
@@ -250,10 +272,15 @@ class _Viewer(_SameOriginHandler, WebSocketHandler):
         self.send(message)
 
     def on_message(self, message: str | bytes) -> None:
-        """Send the waiting frame. The page's only message says that it has shown the previous frame."""
+        """Handle a message. If the last frame has been shown, send the waiting one."""
+        if not self.server.receive(message, self.reply):
+            return
         self.is_busy, next_frame, self.next_frame = False, self.next_frame, None
         if next_frame is not None:
             self.send_frame(next_frame)
+
+    def reply(self, command: Command) -> None:
+        self.send(msgspec.msgpack.encode(command))
 
     def on_close(self) -> None:
         self.server.viewers.discard(self)

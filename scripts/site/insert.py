@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from scripts.site import api, commands, gallery, keys
+from scripts.site import api, commands, gallery, keys, protocol
 
 __all__ = ["INSERTS", "inserted"]
 
@@ -28,6 +28,7 @@ INSERTS: dict[str, Callable[..., str]] = {
     "keys": keys.markdown,
     "commands": commands.markdown,
     "api": api.markdown,
+    "protocol": protocol.markdown,
     "gallery": gallery.markdown,
     "python": lambda name: f"```python\n{_file(name)}\n```",
     "toml": lambda name: f"```toml\n{_file(name)}\n```",

@@ -1,4 +1,4 @@
-"""Write the reference of keys, commands and public names as text: `python -m scripts.site.reference_text`.
+"""Write the reference of keys, commands, public names and messages as text: `python -m scripts.site.reference_text`.
 
 The files in docs/reference/text are committed, so that the reference can be read without building the site.
 """
@@ -15,7 +15,9 @@ import click
 import ckc_pin
 from ckc_pin.cli.app import COMMANDS, ckc
 from ckc_pin.cli.key_tables import FILES, format_tables, tables
+from scripts.site import protocol
 from scripts.site.api import members_of, names
+from scripts.site.protocol import DIRECTIONS
 
 __all__ = ["FOLDER", "texts", "write"]
 
@@ -25,7 +27,7 @@ WIDTH = 100  # of the help of commands
 
 def texts() -> dict[str, str]:
     """Return the content of each file by its name."""
-    lines = {"keys.txt": _keys(), "commands.txt": _commands(), "api.txt": _api()}
+    lines = {"keys.txt": _keys(), "commands.txt": _commands(), "api.txt": _api(), "explorer_protocol.txt": _protocol()}
     return {name: "\n".join(line.rstrip() for line in of_file).rstrip() + "\n" for name, of_file in lines.items()}
 
 
@@ -64,6 +66,12 @@ def _api() -> Iterator[str]:
                 first = (inspect.getdoc(of) or "").partition("\n\n")[0].replace("\n", " ")
                 parentheses = "()" if callable(of) or isinstance(of, classmethod) else ""
                 yield f"\n    .{member}{parentheses}: {first}"
+
+
+def _protocol() -> Iterator[str]:
+    yield "Messages between the explorer's page and the program."
+    for direction in DIRECTIONS:
+        yield from ("", f"## {direction}", "", protocol.markdown(direction))
 
 
 if __name__ == "__main__":

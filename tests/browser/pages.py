@@ -112,11 +112,18 @@ def look_at(browser: Browser) -> Iterator[Callable[..., Visit]]:
     def closing() -> Iterator[None]:
         yield
         for visit in visits:
-            assert visit.complaints == []
+            assert visit.complaints == [], visit.complaints
             visit.page.context.close()
 
-    def open_page(url: str, until: str = "viewer.animator.actions.length", offline: bool = False) -> Visit:
-        context = browser.new_context(viewport={"width": 960, "height": 540}, offline=offline)
+    def open_page(
+        url: str,
+        until: str = "viewer.animator.actions.length",
+        offline: bool = False,
+        size: tuple[int, int] = (960, 540),
+        has_touch: bool = False,
+    ) -> Visit:
+        viewport = {"width": size[0], "height": size[1]}
+        context = browser.new_context(viewport=viewport, offline=offline, has_touch=has_touch)
         visits.append(Visit(context.new_page()))
         visits[-1].page.goto(url)
         visits[-1].until(f"window.viewer && {until}")

@@ -26,7 +26,7 @@ def test_server_sends_page_and_scripts(serve, swing):
     assert "http" not in page.replace("http-equiv", "")  # it names no other place
     assert "default-src 'none'" in policy
     assert f"ws://127.0.0.1:{server.port}" in policy
-    for name, start in (("main.min.js", b"/*! For license"), ("start.js", b"// Controls of a playback page")):
+    for name, start in (("main.min.js", b"/*! For license"), ("start.js", b"// Meshcat's viewer in a page")):
         with urlopen(server.url + name) as answer:
             assert answer.read().startswith(start)
             assert answer.headers["Content-Type"].startswith("text/javascript")

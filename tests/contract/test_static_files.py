@@ -1,4 +1,4 @@
-"""Lint of the player's static files: JavaScript, CSS and HTML, and that they fit together."""
+"""Lint of the static files of the player and the explorer: JavaScript, CSS and HTML, and that they fit together."""
 
 from __future__ import annotations
 
@@ -10,18 +10,25 @@ from pathlib import Path
 import pytest
 from playwright._impl._driver import compute_driver_executable
 
-from ckc_pin.view.page import STATIC, read_live_script
+from ckc_pin.explorer.page import STATIC as EXPLORE
+from ckc_pin.explorer.page import read_explore_script, render_explore_page
+from ckc_pin.view.page import STATIC as VIEW
+from ckc_pin.view.page import read_live_script
 
-SCRIPTS = sorted(STATIC.glob("*.js"))
+FILES = sorted([*VIEW.iterdir(), *EXPLORE.iterdir()])
+SCRIPTS = [path for path in FILES if path.suffix == ".js"]
+SHARED = VIEW / "viewer.js"
+# Page, style and scripts that belong together.
+PAGES = {
+    "player": (VIEW / "page.html", VIEW / "player.css", [path for path in SCRIPTS if path.parent == VIEW]),
+    "explorer": (EXPLORE / "explore.html", EXPLORE / "explore.css",
+                 [SHARED, *(path for path in SCRIPTS if path.parent == EXPLORE)]),
+}  # fmt: skip
 VOID_ELEMENTS = {"meta", "link", "input"}
 MAX_LINE_LENGTH = 120
 UNSAFE = re.compile(r"\b(eval|innerHTML|outerHTML|insertAdjacentHTML|document\.write|new Function)\b")
 FUNCTION = re.compile(r"\bfunction (\w+)\(")
 BINDING = re.compile(r"\b(?:const|let|var) (\w+)")
-
-
-def read_page() -> str:
-    return (STATIC / "page.html").read_text(encoding="utf-8")
 
 
 def remove_comments(script: str) -> str:
@@ -47,17 +54,19 @@ class ElementChecker(HTMLParser):
             self.errors.append(f"</{tag}> at {self.getpos()}")
 
 
-def find_ids() -> set[str]:
+def check_elements(page: Path) -> ElementChecker:
     checker = ElementChecker()
-    checker.feed(read_page())
-    return set(checker.ids)
+    checker.feed(page.read_text(encoding="utf-8"))
+    checker.close()
+    return checker
 
 
 def test_all_static_files_are_checked() -> None:
-    assert {path.name for path in STATIC.iterdir()} == {"live.js", "page.html", "player.css", "player.js", "saved.js"}
+    belonging = {path for page, style, scripts in PAGES.values() for path in (page, style, *scripts)}
+    assert belonging == set(FILES)
 
 
-@pytest.mark.parametrize("path", sorted(STATIC.iterdir()), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_lines_are_short_and_clean(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.endswith("\n")
@@ -86,40 +95,55 @@ def test_scripts_can_be_inlined(path: Path) -> None:
     assert re.search(r"</?script|<!--", path.read_text(encoding="utf-8"), re.IGNORECASE) is None
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
-def test_names_in_scripts_are_used(path: Path) -> None:
-    script = remove_comments(path.read_text(encoding="utf-8"))
-    for name in FUNCTION.findall(script) + BINDING.findall(script):
-        uses = len(re.findall(rf"(?<![\w$]){name}(?![\w$])", script))
-        assert uses > 1 or name in ("player", "showStatus"), name  # the starting scripts use those two
+@pytest.mark.parametrize("name", PAGES)
+def test_names_in_scripts_are_used(name: str) -> None:
+    script = remove_comments("".join(path.read_text(encoding="utf-8") for path in PAGES[name][2]))
+    for used in FUNCTION.findall(script) + BINDING.findall(script):
+        assert len(re.findall(rf"(?<![\w$]){used}(?![\w$])", script)) > 1, used
 
 
 def test_scripts_are_strict() -> None:
-    assert remove_comments(read_live_script()).strip().startswith('"use strict";')
+    for script in (read_live_script(), read_explore_script()):
+        assert remove_comments(script).strip().startswith('"use strict";')
 
 
-def test_html_elements_are_closed_and_ids_unique() -> None:
-    checker = ElementChecker()
-    checker.feed(read_page())
-    checker.close()
+@pytest.mark.parametrize("name", PAGES)
+def test_html_elements_are_closed_and_ids_unique(name: str) -> None:
+    checker = check_elements(PAGES[name][0])
     assert (checker.errors, checker.open_tags) == ([], [])
     assert len(checker.ids) == len(set(checker.ids))
 
 
-def test_ids_in_scripts_and_styles_exist_in_the_page() -> None:
-    ids = find_ids() | {"scene"}  # a saved page has its scene in an element of its own
-    for path in SCRIPTS:
+@pytest.mark.parametrize("name", PAGES)
+def test_ids_in_scripts_and_styles_exist_in_the_page(name: str) -> None:
+    page, style, scripts = PAGES[name]
+    ids = set(check_elements(page).ids) | {"scene"}  # a saved page has its scene in an element of its own
+    for path in scripts:
         script = path.read_text(encoding="utf-8")
-        used = re.findall(r"(?:\belement|getElementById|connectButton)\(\"([\w-]+)\"", script)
+        used = re.findall(r"(?:\belement|getElementById|connectButton|cloneTemplate)\(\"([\w-]+)\"", script)
         used += re.findall(r"#([a-z][\w-]*)\)", script)
         assert set(used) <= ids, path.name
-    css = (STATIC / "player.css").read_text(encoding="utf-8")
-    selectors = "".join(re.findall(r"[^{}]*(?=\{)", css))
+    selectors = "".join(re.findall(r"[^{}]*(?=\{)", style.read_text(encoding="utf-8")))
     assert set(re.findall(r"#([a-z][\w-]*)", selectors)) <= ids
 
 
-def test_css_blocks_and_declarations_are_complete() -> None:
-    css = re.sub(r"/\*.*?\*/", "", (STATIC / "player.css").read_text(encoding="utf-8"), flags=re.DOTALL)
+def test_every_button_of_the_explorer_does_something() -> None:
+    buttons = re.findall(r'<button id="([\w-]+)"', (EXPLORE / "explore.html").read_text(encoding="utf-8"))
+    script = read_explore_script()
+    assert len(buttons) > 15
+    for button in set(buttons) - {"help-close"}:  # closes its dialog by itself
+        assert re.search(rf'^    "?{button}"?: ', script, re.MULTILINE), button
+
+
+def test_title_of_the_explorer_is_escaped() -> None:
+    page = render_explore_page("</title><script>alert(1)</script> $style")
+    assert "<script>alert" not in page
+    assert "&lt;/title&gt;&lt;script&gt;alert(1)&lt;/script&gt; $style" in page
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_css_blocks_and_declarations_are_complete(name: str) -> None:
+    css = re.sub(r"/\*.*?\*/", "", PAGES[name][1].read_text(encoding="utf-8"), flags=re.DOTALL)
     depth = 0
     for brace in re.findall(r"[{}]", css):
         depth += 1 if brace == "{" else -1

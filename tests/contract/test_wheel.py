@@ -8,9 +8,9 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "base", "cli", "codegen",
-         "control", "dynamics", "ensembles", "explore", "formats", "kinematics", "linear", "mechanism", "native", "run",
-         "scene", "sensitivity", "urdf", "view"}  # fmt: skip
+PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "base", "cli", "codegen", "control",
+         "dynamics", "ensembles", "explorer", "formats", "kinematics", "linear", "mechanism", "native", "run", "scene",
+         "sensitivity", "urdf", "view"}  # fmt: skip
 
 
 def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> None:
@@ -30,6 +30,7 @@ def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> Non
     new = {file.name for file in code if file.parts[1:3] == ("cli", "new_files")}
     assert new == {"NAME.urdf", "mechanism.toml", "default.scene.toml"}
     code = {file for file in code if file.name not in new}
-    static = {file.name for file in code if file.parts[1:3] == ("view", "static")}
-    assert static == {path.name for path in (ROOT / "ckc_pin/view/static").iterdir()}
+    for room in ("explore", "view"):
+        static = {file.name for file in code if file.parts[1:3] == (room, "static")}
+        assert static == {path.name for path in (ROOT / "ckc_pin" / room / "static").iterdir()}
     assert {file.suffix for file in code} <= {".py", ".pyi", ".typed", ".html", ".js", ".css"}

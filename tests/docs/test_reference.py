@@ -13,9 +13,10 @@ import ckc_pin
 from ckc_pin import errors
 from ckc_pin.base.key_reference import KeyTable, describe_structure
 from ckc_pin.cli.key_tables import FILES, tables
+from ckc_pin.explorer import messages
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, OTHERS
-from scripts.site import api, commands, keys, reference_text
+from scripts.site import api, commands, keys, protocol, reference_text
 from scripts.site.gallery import ROOT
 from scripts.site.insert import INSERTS, LINE
 from tests.contract.test_cli import CHECK, RUN, STATS, TERMS
@@ -95,6 +96,24 @@ def test_every_public_name_has_a_docstring() -> None:
     assert api.undocumented() == []
     assert sorted(name for named in api.names().values() for name in named) == sorted(ckc_pin.__all__)
     assert "% insert: api\n" in page("reference/api.md")
+
+
+@pytest.mark.parametrize("direction", protocol.DIRECTIONS)
+def test_every_message_of_the_explorer_and_its_fields_have_a_meaning(direction: str) -> None:
+    text = protocol.markdown(direction)
+    for table in protocol.message_tables(direction):
+        assert table.about
+        assert [key.name for key in table.keys if not key.meaning] == []
+        assert set(describe_structure(table.structure)[1]) == {key.name for key in table.keys}
+        assert [key.name for key in table.keys if f"\n| `{key.name}` | " not in text] == []
+    assert f"% insert: protocol {direction}\n" in page("reference/explorer_protocol.md")
+
+
+def test_messages_of_the_explorer_are_complete() -> None:
+    """Every structure of the module is a request, a report or in the field of one."""
+    documented = {table.structure for direction in protocol.DIRECTIONS for table in protocol.message_tables(direction)}
+    structures = {value for value in vars(messages).values() if isinstance(value, type(messages.Move))}
+    assert structures - documented == {messages.Report, messages._FromPage}
 
 
 @pytest.mark.parametrize("name", reference_text.texts())

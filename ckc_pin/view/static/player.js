@@ -3,11 +3,6 @@
 // The viewer understands most drawing commands. This script adds "several" (a list of commands in one message), "say"
 // (the status line), "runs" (what can be shown or hidden) and the playback speed of "set_animation". Text that comes
 // from a user's files is only ever assigned to text nodes, never parsed as HTML.
-"use strict";
-
-// `var` makes the viewer and the player reachable from the browser's console, and from the tests, as window properties.
-var viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
-
 var player = (function () {
   const SPEEDS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5, 1, 2, 4, 5, 10, 20, 50];
   const VIDEO_TYPES = ["video/webm;codecs=vp9", "video/webm", "video/mp4"];
@@ -26,10 +21,6 @@ var player = (function () {
   let isPlaying = false;
   let isLooping = false;
   let recorder = null;
-
-  function element(id) {
-    return document.getElementById(id);
-  }
 
   function findObject(path) {
     return viewer.scene_tree.find(path.split("/").filter(Boolean)).object;
@@ -185,13 +176,6 @@ var player = (function () {
     line.replaceChildren(label);
   }
 
-  // The viewer takes the window's height; the bar below the picture needs a part of it.
-  viewer.set_3d_pane_size = function () {
-    const pane = element("meshcat-pane");
-    viewer.camera.zoom = Math.min(1, pane.offsetWidth / pane.offsetHeight);  // The camera is placed for a square view.
-    MeshCat.Viewer.prototype.set_3d_pane_size.call(viewer, pane.offsetWidth, pane.offsetHeight);
-  };
-
   function startAnimation(options, times) {
     outputTimes = times;
     element("bar").hidden = false;
@@ -263,10 +247,7 @@ var player = (function () {
   }
 
   function saveVideo(chunks, type) {
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob(chunks, {type: type}));
-    link.download = document.title.replace(/[^\w.-]+/g, "_") + (type === "video/mp4" ? ".mp4" : ".webm");
-    link.click();
+    saveFile(new Blob(chunks, {type: type}), nameFile(type === "video/mp4" ? ".mp4" : ".webm"));
   }
 
   // --- keys and buttons ---------------------------------------------------------------------------------------------
@@ -328,10 +309,6 @@ var player = (function () {
   setTimeout(function () { requestAnimationFrame(followAnimation); });
   return {seek: seek, play: play, pause: pause, setRuns: setRuns, startAnimation: startAnimation};
 })();
-
-function showStatus(text) {
-  document.getElementById("status").textContent = text;
-}
 
 viewer.handle_command = function (command) {
   if (command.type === "several") {

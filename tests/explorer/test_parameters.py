@@ -9,7 +9,7 @@ import pytest
 
 import ckc_pin
 from ckc_pin import InputError, MechanismError
-from ckc_pin.explore.parameters import list_parameters, rebuild
+from ckc_pin.explorer.parameters import list_parameters, rebuild
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.parameters import values_of, with_components
 from tests.analytic.five_bar import FIVE_BAR

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.explore.branches import MAX_LISTED, draw_branches, find_branches, list_branches
-from ckc_pin.explore.paths import BRANCHES
+from ckc_pin.explorer.branches import MAX_LISTED, draw_branches, find_branches, list_branches
+from ckc_pin.explorer.paths import BRANCHES
 from ckc_pin.kinematics.sigma import sigma
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close

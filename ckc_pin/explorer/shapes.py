@@ -11,8 +11,8 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import NumericalError
-from ckc_pin.explore.paths import EXPLORED
-from ckc_pin.explore.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.explorer.paths import EXPLORED
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.kinematics.sigma import SINGULAR_MARGIN
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from ckc_pin.explore.background import NewestTask
+from ckc_pin.explorer.background import NewestTask
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

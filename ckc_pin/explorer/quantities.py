@@ -11,11 +11,11 @@ from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
 from ckc_pin.base.validation import suggest_name
 from ckc_pin.control.actuation import DRIVE_TOLERANCE, Actuation
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.explore.forces import Forces, HoldingTorques
-from ckc_pin.explore.messages import QuantityInfo
-from ckc_pin.explore.nearest import NearestSingularity
-from ckc_pin.explore.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
-from ckc_pin.explore.shapes import CentreOfMass, Ellipsoids, LoopFrames, Traces
+from ckc_pin.explorer.forces import Forces, HoldingTorques
+from ckc_pin.explorer.messages import QuantityInfo
+from ckc_pin.explorer.nearest import NearestSingularity
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.explorer.shapes import CentreOfMass, Ellipsoids, LoopFrames, Traces
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.rank import scale_jacobian

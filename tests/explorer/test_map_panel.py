@@ -11,9 +11,9 @@ import pytest
 from matplotlib.image import imread
 
 import ckc_pin
-from ckc_pin.explore.branches import find_branches
-from ckc_pin.explore.map_panel import MapPanel, explain_no_map, select_aspect
-from ckc_pin.explore.messages import MapImage
+from ckc_pin.explorer.branches import find_branches
+from ckc_pin.explorer.map_panel import MapPanel, explain_no_map, select_aspect
+from ckc_pin.explorer.messages import MapImage
 from tests.analytic.five_bar import FIVE_BAR, Array
 
 FINAL = 120.0  # s, until the last image of a map

@@ -13,7 +13,7 @@ from ckc_pin.dynamics.equilibrium import weight
 from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.explore.paths import SHOWN
+from ckc_pin.explorer.paths import SHOWN
 from ckc_pin.kinematics.sigma import SINGULAR_MARGIN
 from ckc_pin.linear.statics import balance_at_rest, closest_torques
 from ckc_pin.mechanism.configuration import Kinematics

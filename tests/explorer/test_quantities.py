@@ -12,11 +12,11 @@ from scipy.optimize import minimize_scalar
 import ckc_pin
 from ckc_pin import InputError, Mechanism
 from ckc_pin.analysis.singularities import search_singular
-from ckc_pin.explore.forces import compute_pose_forces
-from ckc_pin.explore.paths import EXPLORED, SHOWN
-from ckc_pin.explore.quantities import QUANTITIES, Quantities
-from ckc_pin.explore.quantity import PoseState
-from ckc_pin.explore.shapes import TRACE_LENGTH, compute_ellipsoids
+from ckc_pin.explorer.forces import compute_pose_forces
+from ckc_pin.explorer.paths import EXPLORED, SHOWN
+from ckc_pin.explorer.quantities import QUANTITIES, Quantities
+from ckc_pin.explorer.quantity import PoseState
+from ckc_pin.explorer.shapes import TRACE_LENGTH, compute_ellipsoids
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import library, shipped
 from ckc_pin.view.commands import SceneState

@@ -13,7 +13,7 @@ from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import NumericalError
-from ckc_pin.explore.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import effort, motor_units
 from ckc_pin.view.arrows import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ckc_pin.explore.messages import ParameterInfo
+from ckc_pin.explorer.messages import ParameterInfo
 from ckc_pin.kinematics.assembly import reassemble
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism

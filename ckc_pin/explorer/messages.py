@@ -74,8 +74,8 @@ class Move(_FromPage, frozen=True):
     ----------
     coordinate
         A coordinate of the tree.
-    value
-        rad or m.
+    value : rad, m
+        The value to move to.
     """
 
     coordinate: Name
@@ -89,10 +89,10 @@ class Drag(_FromPage, frozen=True):
     ----------
     body
         Name of the joint that moves the body.
-    point
-        Its position in the body's axes, m.
-    target
-        Where the mouse is, in the world, m.
+    point : m
+        Its position in the body's axes.
+    target : m
+        Where the mouse is, in the world.
     normal
         Normal of the plane in which the mouse moves, in the world. The distance along it is not reduced. Absent: all
         three directions count.
@@ -125,15 +125,21 @@ class GoTo(_FromPage, frozen=True):
 
     Attributes
     ----------
-    values
-        rad or m, by coordinate.
+    values : rad, m
+        Values by coordinate.
     """
 
     values: dict[Name, Finite]
 
 
 class ListBranches(_FromPage, frozen=True):
-    """Search the assembly branches at the present q and draw them as ghosts; with `on` false, remove them."""
+    """Search the assembly branches at the present q and draw them as ghosts.
+
+    Attributes
+    ----------
+    on
+        False: remove the ghosts and the list.
+    """
 
     on: bool = True
 
@@ -144,27 +150,49 @@ class SelectBranch(_FromPage, frozen=True):
     Attributes
     ----------
     index
-        Place in the last `branches` report.
+        Place in the last report `branch_list`, from 0.
     """
 
     index: Annotated[int, msgspec.Meta(ge=0, le=10_000)]
 
 
 class ShowMap(_FromPage, frozen=True):
-    """Compute the singularity map; with `on` false, hide it."""
+    """Compute the singularity map.
+
+    Attributes
+    ----------
+    on
+        False: hide it.
+    """
 
     on: bool = True
 
 
 class Show(_FromPage, frozen=True):
-    """Show or hide a quantity of `setup.quantities`. A hidden quantity is not computed."""
+    """Show or hide a quantity. A hidden quantity is not computed.
+
+    Attributes
+    ----------
+    quantity
+        Name of a quantity of `setup`.
+    on
+        Whether to show it.
+    """
 
     quantity: Name
     on: bool
 
 
 class SetParameter(_FromPage, frozen=True):
-    """Rebuild the mechanism with a named parameter and assemble it near the present pose."""
+    """Rebuild the mechanism with a named parameter and assemble it near the present pose.
+
+    Attributes
+    ----------
+    name
+        Name of a parameter of `setup`.
+    value
+        Its new value, in the parameter's unit.
+    """
 
     name: Name
     value: Finite
@@ -187,7 +215,7 @@ class StartRun(_FromPage, frozen=True):
     rtol
         Relative tolerance.
     formulation
-        Default: the scene's.
+        Absent: the scene's.
     """
 
     mode: Literal["free", "scene", "hold"] = "free"
@@ -197,13 +225,25 @@ class StartRun(_FromPage, frozen=True):
 
 
 class Pause(_FromPage, frozen=True):
-    """Pause or continue a run."""
+    """Pause or continue a run.
+
+    Attributes
+    ----------
+    on
+        False: continue from the time that is shown.
+    """
 
     on: bool = True
 
 
 class Rewind(_FromPage, frozen=True):
-    """Show an earlier time of a run, which continues from there after `pause` with `on` false."""
+    """Show an earlier time of a run, which continues from there after `pause` with `on` false.
+
+    Attributes
+    ----------
+    t : s
+        The time to show.
+    """
 
     t: Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 
@@ -219,8 +259,8 @@ class SetMotor(_FromPage, frozen=True):
     ----------
     name
         A motor, or a coordinate.
-    value
-        N m or N of the motor; rad or m of the coordinate.
+    value : N m, N, rad, m
+        Torque or force of the motor, or target of the coordinate.
     """
 
     name: Name
@@ -233,8 +273,9 @@ class Save(_FromPage, frozen=True):
     Attributes
     ----------
     what
+        What to save.
     name
-        Of the file, without its ending.
+        Name of the file, without its ending.
     """
 
     what: Literal["scene", "parameters", "run"]
@@ -242,7 +283,13 @@ class Save(_FromPage, frozen=True):
 
 
 class CopyText(_FromPage, frozen=True):
-    """Ask for text to copy: the pose as [q_guess], Python lines that reproduce the state, or an SVG picture."""
+    """Ask for text to copy; the report `text` answers.
+
+    Attributes
+    ----------
+    what
+        The pose as [q_guess], Python lines that reproduce the state, or an SVG picture.
+    """
 
     what: Literal["q_guess", "python", "svg"]
 
@@ -282,20 +329,47 @@ def read_request(message: str | bytes) -> Request:
 # --- to the page ---------------------------------------------------------------------------------
 
 
+def _convert_scalar(value: Any) -> float | int:
+    """Convert a scalar of NumPy, which msgspec does not know."""
+    return value.item()
+
+
 class Report(msgspec.Struct, frozen=True, kw_only=True):
     """Base of the program's reports, which the page gets as a command {"type": "report", "path": ..., ...}.
 
     The newest report of each kind is kept for pages that connect later.
     """
 
+    @classmethod
+    def kind(cls) -> str:
+        """Return the kind of the report as "pose" for `PoseReport`."""
+        return _tag(cls.__name__.removesuffix("Report"))
+
     def to_command(self) -> dict[str, Any]:
-        """Return the report as a command of the viewer; its path is the kind of the report, as "pose"."""
-        kind = _tag(type(self).__name__.removesuffix("Report"))
-        return {"type": "report", "path": kind, "content": msgspec.to_builtins(self)}
+        """Return the report as a command of the viewer; its path is the kind of the report."""
+        return {"type": "report", "path": self.kind(), "content": msgspec.to_builtins(self, enc_hook=_convert_scalar)}
 
 
 class CoordinateInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A slider. `lower` and `upper` are the ends of its scale; `has_stops`: they are its limits."""
+    """A coordinate's slider.
+
+    Attributes
+    ----------
+    name
+        The coordinate.
+    unit
+        Unit of its values.
+    lower : rad, m
+        Lower end of the slider.
+    upper : rad, m
+        Upper end of the slider.
+    has_stops
+        Whether the ends are the coordinate's limits.
+    is_independent
+        Whether it belongs to q. The others are dependent, z.
+    motors
+        Names of the motors that drive it.
+    """
 
     name: str
     unit: Literal["rad", "m"]
@@ -307,7 +381,19 @@ class CoordinateInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotorInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A motor: its unit (N m or N), the end of its torque slider, and the coordinates that it drives."""
+    """A motor's slider, which is shown during a run in mode "free".
+
+    Attributes
+    ----------
+    name
+        The motor.
+    unit
+        Unit of its torque, N m, or of its force, N.
+    limit : N m, N
+        Upper end of the slider. The lower end is its negative.
+    coordinates
+        Names of the coordinates that it drives.
+    """
 
     name: str
     unit: str
@@ -316,7 +402,25 @@ class MotorInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ParameterInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A parameter's slider: its name as in a scene's [parameters], value, the value of the files, unit and scale."""
+    """A parameter's slider.
+
+    Attributes
+    ----------
+    name
+        Its name, as in a scene's [parameters].
+    group
+        Heading under which the page lists it.
+    unit
+        Unit of its values.
+    value
+        Its present value.
+    default
+        Its value in the files.
+    lower
+        Lower end of the slider.
+    upper
+        Upper end of the slider.
+    """
 
     name: str
     group: str
@@ -328,7 +432,19 @@ class ParameterInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class QuantityInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """A quantity that can be shown. `unavailable` tells why it cannot be shown for this mechanism, if it cannot."""
+    """A quantity that can be shown.
+
+    Attributes
+    ----------
+    name
+        Its name in `show` and in `pose.quantities`.
+    label
+        Text of its checkbox.
+    on
+        Whether it is shown.
+    unavailable
+        Why it cannot be shown for this mechanism; "" if it can.
+    """
 
     name: str
     label: str
@@ -341,19 +457,32 @@ class Setup(Report, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    title, summary
-        Name of the mechanism, and one line about it: coordinates, freedoms.
-    coordinates, motors, parameters, quantities
+    title
+        Name of the mechanism or scene.
+    summary
+        One line about it: coordinates, freedoms.
+    coordinates
+        Sliders of the coordinates.
+    motors
+        Sliders of the motors.
+    parameters
+        Sliders of the parameters.
+    quantities
+        What can be shown.
     bodies
         Path in the scene of each body that can be dragged, by the name of its joint.
     points
         Named points: [name of the joint, x, y, z] in its axes.
     normal
-        Normal of a planar mechanism's plane in the world.
+        Normal of a planar mechanism's plane in the world; absent for other mechanisms.
     modes
         Modes of `start_run` that this mechanism has.
+    formulation
+        Formulation that a run uses by default.
     can_map
         Whether there is a singularity map.
+    can_branch
+        Whether branches can be listed.
     warnings
         Of the mechanism, and why it is not closed.
     can_save
@@ -382,10 +511,10 @@ class PoseReport(Report, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    values
-        Coordinates, rad or m.
-    closure
-        Largest |phi|, m or rad.
+    values : rad, m
+        Values of all coordinates by name.
+    closure : m, rad
+        Largest |phi|.
     end
         Why the last movement ended before its target: "theta_1 is at its upper limit", or "".
     ended
@@ -395,7 +524,10 @@ class PoseReport(Report, frozen=True, kw_only=True):
         home.
     quantities
         Lines of text of each quantity that is shown: [label, value].
-    can_undo, can_redo
+    can_undo
+        Whether there is a pose to undo to.
+    can_redo
+        Whether there is a pose to redo.
     """
 
     values: dict[str, float]
@@ -409,7 +541,17 @@ class PoseReport(Report, frozen=True, kw_only=True):
 
 
 class BranchList(Report, frozen=True, kw_only=True):
-    """Assembly branches at the present q: a line of text each; `current` is the present one. Empty: none are shown."""
+    """Assembly branches at the present q.
+
+    Attributes
+    ----------
+    branches
+        A line of text for each. Empty: none are shown.
+    current
+        Place of the present branch in the list, from 0.
+    note
+        A remark below the list's button.
+    """
 
     branches: list[str]
     current: int
@@ -421,14 +563,20 @@ class MapImage(Report, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    x, y
-        Coordinates of the axes; y is "" for a mechanism of one freedom.
-    x_range, y_range
-        rad or m.
-    x_turns, y_turns
-        Whether the axis is a full turn, so that the place of a point is found modulo 2 pi.
+    x
+        Coordinate of the horizontal axis.
+    y
+        Coordinate of the vertical axis; "" for a mechanism of one freedom.
+    x_range : rad, m
+        Values of x at the left and right edges.
+    y_range : rad, m
+        Values of y at the lower and upper edges.
+    x_turns
+        Whether the horizontal axis is a full turn, so that the place of a point is found modulo 2 pi.
+    y_turns
+        The same of the vertical axis.
     image
-        PNG as base64, its rows from the upper end of y downwards.
+        PNG as base64, its rows from the upper end of y downwards. "": no map is shown.
     note
         What the colours mean, or why there is no map.
     """
@@ -437,9 +585,9 @@ class MapImage(Report, frozen=True, kw_only=True):
     y: str = ""
     x_range: list[float] = []
     y_range: list[float] = []
+    image: str = ""
     x_turns: bool = False
     y_turns: bool = False
-    image: str = ""
     note: str = ""
 
 
@@ -449,13 +597,19 @@ class RunReport(Report, frozen=True, kw_only=True):
     Attributes
     ----------
     state
-        "none", "running", "paused" or "stopped".
-    t, t_last
-        Time that is shown, and the last one that was computed, s.
+        Whether a run exists and proceeds.
+    t : s
+        Time that is shown.
+    t_last : s
+        Last time that was computed.
     message
         Why it stopped, or a remark.
     real_time
         Simulated seconds per second that were reached; it is less than the speed if the computation is too slow.
+    mode
+        Mode of the last `start_run`; "" before the first.
+    motors
+        What `set_motor` sets, by name: torques in mode "free", targets in mode "hold". Other modes: empty.
     """
 
     state: Literal["none", "running", "paused", "stopped"] = "none"
@@ -463,10 +617,24 @@ class RunReport(Report, frozen=True, kw_only=True):
     t_last: float = 0.0
     message: str = ""
     real_time: float = 0.0
+    mode: str = ""
+    motors: dict[str, float] = {}
 
 
 class TextReport(Report, frozen=True, kw_only=True):
-    """Text to copy or a picture to save. `serial` increases, so that a page recognises a new one."""
+    """Text to copy or a picture to save. Only the page that asked for it uses it.
+
+    Attributes
+    ----------
+    title
+        What it is.
+    text
+        The text, or the picture as SVG.
+    file_name
+        Name of the file to save it as. "": the text is copied.
+    serial
+        Increases with each text.
+    """
 
     title: str
     text: str
@@ -475,7 +643,17 @@ class TextReport(Report, frozen=True, kw_only=True):
 
 
 class Notice(Report, frozen=True, kw_only=True):
-    """A message to read: what was refused or done."""
+    """A message to read: what was refused or done.
+
+    Attributes
+    ----------
+    text
+        The message.
+    is_error
+        Whether something was refused. The page shows such a message until it is closed.
+    serial
+        Increases with each message.
+    """
 
     text: str
     is_error: bool = False

@@ -9,8 +9,8 @@ import numpy as np
 
 from ckc_pin.analysis.map.compute import singularity_map
 from ckc_pin.errors import CkcError
-from ckc_pin.explore.background import NewestTask
-from ckc_pin.explore.messages import MapImage
+from ckc_pin.explorer.background import NewestTask
+from ckc_pin.explorer.messages import MapImage
 from ckc_pin.kinematics.mapped import LABELS, SingularityMap
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism

@@ -13,8 +13,8 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.summary import format_quantities
 from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import CkcError
-from ckc_pin.explore.background import NewestTask
-from ckc_pin.explore.quantity import DIGITS, LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.explorer.background import NewestTask
+from ckc_pin.explorer.quantity import DIGITS, LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.kinematics.mapped import NearestSingular
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism

@@ -8,8 +8,8 @@ import numpy as np
 
 from ckc_pin.base.summary import format_quantities
 from ckc_pin.errors import InputError
-from ckc_pin.explore.messages import BranchList
-from ckc_pin.explore.paths import BRANCHES
+from ckc_pin.explorer.messages import BranchList
+from ckc_pin.explorer.paths import BRANCHES
 from ckc_pin.kinematics.sigma import assembly_branches
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
