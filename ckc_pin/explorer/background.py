@@ -35,11 +35,13 @@ class NewestTask(Generic[T]):
         self.is_busy = False  # from a request to the end of its computation
 
     def request(self, what: T) -> None:
-        """Compute this next."""
+        """Compute this next; nothing after `close`."""
         with self._changed:
+            if self._closed:
+                return
             self._waiting, self.is_busy = [what], True
             self._changed.notify()
-            if self._thread is None and not self._closed:
+            if self._thread is None:
                 self._thread = Thread(target=self._run, name=self._name, daemon=True)
                 self._thread.start()
 

@@ -12,6 +12,7 @@ from ckc_pin.control.forces import generalized_force
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import NumericalError
 from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import effort, motor_units
@@ -53,10 +54,13 @@ class HoldingTorques(LiveQuantity):
         mechanism, static = self.mechanism, state.static_forces
         names = mechanism.independent
         units = [effort(mechanism.tree.units()[k]) for k in mechanism.partition.q]
-        lines = _label("h of", names, state.rest.h, units)
+        lines = [["h", "not defined: phi_z is singular here"]]
+        if not state.is_singular:
+            lines = _label("h of", names, state.rest.h, units)
         lines += _label("motor", mechanism.actuated, static.tau, motor_units(mechanism))
         if static.reason:
             lines.append(["not held", static.reason])
+        if static.reason and not state.is_singular:
             lines += _label("remains along", names, static.missing, units)
         if static.loaded_stops:
             lines.append(["stops that hold it", ", ".join(static.loaded_stops)])
@@ -98,7 +102,7 @@ class Forces(LiveQuantity):
         shown.commands += self._place(arrows)
         lines = [["long arrows", format_arrow_scales(self.scales) or "no forces"]]
         lines += [[f"loop {name}", _format_wrench(wrench)] for name, wrench in loops.items()]
-        largest = sorted(joints, key=lambda name: -float(np.linalg.norm(joints[name][:3])))[:MAX_JOINT_LINES]
+        largest = sorted(joints, key=lambda name: -float(joints[name][:3] @ joints[name][:3]))[:MAX_JOINT_LINES]
         lines += [[f"joint {name}", _format_wrench(joints[name])] for name in largest]
         if len(joints) > MAX_JOINT_LINES:
             lines.append(["", f"and {len(joints) - MAX_JOINT_LINES} joints with smaller forces"])
@@ -128,8 +132,8 @@ class Forces(LiveQuantity):
     def _choose_scales(self, arrows: list[Arrow]) -> None:
         """Keep the scale of forces and of torques while the largest arrow fits to it, so that arrows compare."""
         for is_torque in (False, True):
-            sizes = [float(np.linalg.norm(arrow.vector[0])) for arrow in arrows if arrow.is_torque == is_torque]
-            largest = max(sizes, default=0.0)
+            vectors = np.array([arrow.vector[0] for arrow in arrows if arrow.is_torque == is_torque]).reshape(-1, 3)
+            largest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
             scale = self.scales.get(is_torque, 0.0)
             if largest > MIN_FORCE and not MIN_SCALE_RATIO * scale <= largest <= scale:
                 self.scales[is_torque] = _round_up(largest)
@@ -144,11 +148,13 @@ def compute_pose_forces(state: PoseState) -> tuple[dict[str, Array], dict[str, A
     Raises
     ------
     NumericalError
-        J has lost rank.
+        J has lost rank, or the motors cannot hold the pose and phi_z is singular.
     """
     mechanism, wrenches = state.mechanism, state.link_wrenches
     if state.v_tree is None:
         terms, tau = state.rest, state.static_forces.tau
+        if np.isnan(state.static_forces.missing).any():
+            raise NumericalError("the motors cannot hold this pose, and phi_z is singular here")
         other_force = state.static_forces.passive_force.copy()
         other_force[state.at.partition.q] += state.static_forces.missing
         acceleration = np.zeros(mechanism.n)

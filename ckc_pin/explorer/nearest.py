@@ -21,7 +21,12 @@ from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
 __all__ = ["NearestSingularity"]
 
+ABANDON_AFTER_S = 3.0  # a longer search is given up for a newer pose, so that a pose at rest is searched at once
 MIN_GAP_RATIO = 0.01  # of the distance: coordinates that differ less are not listed
+
+
+class _Outdated(Exception):
+    """The search is given up for a newer pose, or because the quantity was hidden."""
 
 
 class NearestSingularity(LiveQuantity):
@@ -100,12 +105,23 @@ class NearestSingularity(LiveQuantity):
         mechanism.q_tree = q_tree  # the search begins at the assembled configuration
         q = mechanism.independent_part(q_tree)
         rest = (q, np.zeros_like(q), np.zeros_like(q))
+
+        def stand_still(t: float) -> tuple[Array, Array, Array]:
+            """Return the pose as a trajectory; the search asks for it before each of its steps."""
+            if self._task is None or (is_outdated() and perf_counter() - time > ABANDON_AFTER_S):
+                raise _Outdated
+            return rest
+
         result: NearestSingular | str | None
         try:
             with one_blas_thread():
-                result = find_nearest_singular(mechanism, lambda t: rest, np.zeros(1))
+                result = find_nearest_singular(mechanism, stand_still, np.zeros(1))
+        except _Outdated:
+            return
         except CkcError as error:
             result = str(error)
+        if self._task is None:  # hidden in the meantime
+            return
         self._result = (q_tree, time, result)
         if self.on_update is not None:
             self.on_update()

@@ -9,7 +9,7 @@ from ckc_pin.explorer.messages import ParameterInfo
 from ckc_pin.kinematics.assembly import reassemble
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Value, split_component, split_name, values_of, with_components
+from ckc_pin.mechanism.parameters import split_component, split_name, values_of, with_components
 from ckc_pin.mechanism.units import parameter_unit
 from ckc_pin.mechanism.warnings import compute_moving_mass
 
@@ -68,13 +68,10 @@ def rebuild(mechanism: Mechanism, values: Mapping[str, float], at: Kinematics) -
     InputError, MechanismError
         An unknown name or an invalid value; or the reason why the mechanism cannot be assembled here.
     """
-    present: dict[str, Value] = {}
-    for name, value in mechanism.overrides.items():
-        is_vector = isinstance(value, tuple)
-        components = {x: y for x, y in with_components({name: value}).items() if not (is_vector and x == name)}
-        present |= components
+    overrides = {name: x for name, x in with_components(mechanism.overrides).items() if not isinstance(x, tuple)}
+    overrides |= {name: float(value) for name, value in values.items()}
     with mechanism.sources.prefix_errors():
-        return reassemble(mechanism, present | dict(values), at)
+        return reassemble(mechanism, overrides, at)
 
 
 def _scalars(mechanism: Mechanism) -> dict[str, float]:

@@ -9,10 +9,13 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, lazy
 from ckc_pin.control.actuation import Actuation
+from ckc_pin.dynamics.equilibrium import weight
+from ckc_pin.dynamics.formulations import tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.explorer.paths import SHOWN
-from ckc_pin.linear.statics import balance_at_rest, closest_torques, compute_velocity_basis
+from ckc_pin.kinematics.sigma import SINGULAR_MARGIN
+from ckc_pin.linear.statics import balance_at_rest, closest_torques
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.view import commands
@@ -22,6 +25,7 @@ from ckc_pin.view.geometry import Placements
 __all__ = ["LiveQuantity", "PoseState", "ShownQuantities", "StaticForces", "format_number"]
 
 DIGITS = 4
+MAX_TORQUE_RATIO = 1e9  # of a torque to the weight times the mechanism's size: a larger one comes from rounding
 
 
 def format_number(value: float, unit: str = "") -> str:
@@ -58,7 +62,7 @@ class StaticForces:
     passive_force : (n,) array
         Of loaded stops and dry friction on the tree.
     missing : (d,) array
-        Part of h that remains, along the independent coordinates.
+        Part of h that remains, along the independent coordinates; NaN if it remains where phi_z is singular.
     reason : str
         Why a part remains, or an empty text.
     loaded_stops : tuple of str
@@ -108,23 +112,34 @@ class PoseState:
         return Terms(self.mechanism, self.at, np.zeros(self.mechanism.n))
 
     @lazy
+    def is_singular(self) -> bool:
+        """Whether phi_z is singular to working precision, so that rho, h and what depends on them do not exist."""
+        return self.at.margin() <= SINGULAR_MARGIN
+
+    @lazy
     def velocities(self) -> Array:
         """Basis of the velocities that the loops allow, (n, d) (NumericalError where J has lost rank)."""
-        return compute_velocity_basis(self.rest)
+        return tangent_basis(self.rest, np.zeros(self.mechanism.closure.rows))[0]
 
     @lazy
     def static_forces(self) -> StaticForces:
-        """Forces that hold the pose at rest."""
-        mechanism, rest = self.mechanism, self.rest
+        """Forces that hold the pose at rest (NumericalError where J has lost rank)."""
+        mechanism, rest, velocities = self.mechanism, self.rest, self.velocities
+        none, undefined = np.zeros(mechanism.n), np.full(mechanism.d, np.nan)
+        reason, stops, uses_friction, missing = "", (), False, np.zeros(mechanism.d)
         try:
             balance = balance_at_rest(rest, self.actuation, has_friction=True)
+            tau, passive, uses_friction = balance.tau, balance.passive_force, balance.uses_friction
+            stops = tuple(mechanism.coordinates[k] for k in balance.loaded_stops)
         except InputError as error:
-            tau = closest_torques(rest, self.velocities, self.actuation)
-            missing = rest.rho.T @ (rest.h_tree - mechanism.motors.force(tau))
-            return StaticForces(tau, np.zeros(mechanism.n), missing, str(error).removeprefix(f"{mechanism.name}: "))
-        stops = tuple(mechanism.coordinates[k] for k in balance.loaded_stops)
-        missing = np.zeros(len(self.at.partition.q))
-        return StaticForces(balance.tau, balance.passive_force, missing, "", stops, balance.uses_friction)
+            tau, passive = closest_torques(rest, velocities, self.actuation), none
+            reason = str(error).removeprefix(f"{mechanism.name}: ")
+            remaining = rest.h_tree - mechanism.motors.force(tau)
+            missing = undefined if self.is_singular else rest.rho.T @ remaining
+        if np.abs(tau).max(initial=0.0) > MAX_TORQUE_RATIO * (1.0 + weight(mechanism)):
+            reason = "no finite torque of the motors holds it: they are at a dead centre"
+            return StaticForces(0.0 * tau, none, undefined, reason)
+        return StaticForces(tau, passive, missing, reason, stops, uses_friction)
 
     @lazy
     def placements(self) -> Placements:

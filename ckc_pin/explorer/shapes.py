@@ -13,6 +13,7 @@ from ckc_pin.control.actuation import Actuation
 from ckc_pin.errors import NumericalError
 from ckc_pin.explorer.paths import EXPLORED
 from ckc_pin.explorer.quantity import LiveQuantity, PoseState, ShownQuantities, format_number
+from ckc_pin.kinematics.sigma import SINGULAR_MARGIN
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined
@@ -83,7 +84,8 @@ class Ellipsoids(LiveQuantity):
                 commands.set_transform(self._path(name), homogeneous(axes * drawn, state.points[name]))
             )
             texts = ", ".join(format_number(x) for x in np.where(semi_axes < 1e-12, 0.0, semi_axes))
-            lines.append([name, f"{texts} m/s at 1 {unit}"])
+            note = "; drawn shorter" if self.scale * semi_axes[0] > MAX_SEMI_AXIS * size else ""
+            lines.append([name, f"{texts} m/s at 1 {unit}{note}"])
         return [*lines, ["drawn at", f"{format_number(self.scale)} m for 1 m/s"]]
 
     def _path(self, point: str) -> str:
@@ -100,7 +102,7 @@ def compute_ellipsoids(mechanism: Mechanism, at: Kinematics) -> dict[str, Array]
     NumericalError
         phi_z is singular, or the motors' rates do not determine the motion.
     """
-    if at.phi_z_factor.singular:
+    if at.margin() <= SINGULAR_MARGIN:
         raise NumericalError("phi_z is singular here, so q_dot does not determine the velocities")
     to_velocity = at.rho
     if _has_rates_of_motors(mechanism):

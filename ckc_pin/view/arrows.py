@@ -86,12 +86,12 @@ def create_loop_arrows(mechanism: Mechanism, wrenches: Sequence[Mapping[str, Arr
 
 def create_motor_arrows(mechanism: Mechanism, tau: Array, poses: Placements) -> list[Arrow]:
     """Return an arrow at each driven joint, from motor torques (m, motors)."""
-    arrows, model, efforts = [], mechanism.tree.model, tau @ mechanism.motors.transmission
+    arrows, model, efforts = [], mechanism.tree.model, np.nan_to_num(tau @ mechanism.motors.transmission)
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
         if model.joints[joint].nv == 1 and np.any(mechanism.motors.transmission[:, column]):
             axis, is_rotation = mechanism.tree.axis(joint)
-            vector = (poses.rotation[:, joint] @ axis) * np.nan_to_num(efforts[:, column, None])
+            vector = (poses.rotation[:, joint] @ axis) * efforts[:, column, None]
             name = f"motor:{model.names[joint]}"
             arrows.append(Arrow(name, MOTOR_COLOUR, is_rotation, poses.translation[:, joint], vector))
     return arrows
@@ -142,16 +142,22 @@ def create_arrow_tracks(
 ) -> Iterator[Track]:
     """Create the keyframes that place, rotate and scale arrows; `size` is the mechanism's, m."""
     for arrow in arrows:
-        rotations, lengths = _orient(arrow, size, scales)
-        values = {"position": arrow.position, "quaternion": rotations, "scale": np.tile(lengths[:, None], (1, 3))}
+        lengths = _drawn_lengths(arrow.vector, scales.get(arrow.is_torque, 1.0), size)
+        values = {
+            "position": arrow.position,
+            "quaternion": np.array([rotation.coeffs() for rotation in _orient(arrow.vector)]),
+            "scale": np.tile(lengths[:, None], (1, 3)),
+        }
         yield Track(_arrow_path(root, arrow), t, values)
 
 
 def place_arrows(root: str, arrows: Sequence[Arrow], size: float, scales: Mapping[bool, float]) -> Iterator[Command]:
     """Place, rotate and scale arrows at the first of their poses; `size` is the mechanism's, m."""
-    for arrow in arrows:
-        rotations, lengths = _orient(arrow, size, scales)
-        matrix = homogeneous(pin.Quaternion(rotations[0]).matrix() * lengths[0], arrow.position[0])
+    vectors = np.array([arrow.vector[0] for arrow in arrows]).reshape(-1, 3)
+    full = np.array([scales.get(arrow.is_torque, 1.0) for arrow in arrows])
+    lengths = _drawn_lengths(vectors, full, size)
+    for arrow, rotation, length in zip(arrows, _orient(vectors), lengths, strict=True):
+        matrix = homogeneous(length * rotation.matrix(), arrow.position[0])
         yield commands.set_transform(_arrow_path(root, arrow), matrix)
 
 
@@ -159,13 +165,16 @@ def _arrow_path(root: str, arrow: Arrow) -> str:
     return f"{forces_path(root)}/{escape_path(arrow.name)}"
 
 
-def _orient(arrow: Arrow, size: float, scales: Mapping[bool, float]) -> tuple[Array, Array]:
-    """Return the quaternions (m, 4) and the lengths (m,), m, with which an arrow is drawn."""
+def _drawn_lengths(vectors: Array, full: Array | float, size: float) -> Array:
+    """Return the lengths, m, at which vectors (m, 3) are drawn; vectors of size `full` are drawn at full length."""
+    ratios = np.linalg.norm(vectors, axis=1) / full
+    return np.asarray(FULL_LENGTH * size * np.maximum(np.minimum(ratios, MAX_LENGTH_RATIO), MIN_LENGTH_RATIO))
+
+
+def _orient(vectors: Array) -> list[pin.Quaternion]:
+    """Return the rotations that turn z to vectors (m, 3); none for zero vectors."""
     z = np.array([0.0, 0.0, 1.0])
-    ratios = np.linalg.norm(arrow.vector, axis=1) / scales.get(arrow.is_torque, 1.0)
-    lengths = FULL_LENGTH * size * np.maximum(np.minimum(ratios, MAX_LENGTH_RATIO), MIN_LENGTH_RATIO)
-    rotations = np.array([pin.Quaternion.FromTwoVectors(z, v if np.any(v) else z).coeffs() for v in arrow.vector])
-    return rotations, lengths
+    return [pin.Quaternion.FromTwoVectors(z, v if v.any() else z) for v in vectors]
 
 
 # --- shapes --------------------------------------------------------------------------------------

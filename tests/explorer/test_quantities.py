@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.optimize import minimize_scalar
 
 import ckc_pin
 from ckc_pin import InputError, Mechanism
+from ckc_pin.analysis.singularities import search_singular
 from ckc_pin.explorer.forces import compute_pose_forces
 from ckc_pin.explorer.paths import EXPLORED, SHOWN
 from ckc_pin.explorer.quantities import QUANTITIES, Quantities
@@ -114,6 +116,21 @@ def test_quantity_that_does_not_exist_at_a_pose_says_why() -> None:
     assert lines["centre_of_mass"][0][0] == "x"
 
 
+@pytest.mark.parametrize("name", ["five_bar", "delta", "bricard"])
+def test_singular_poses_give_texts_and_finite_drawings(name: str) -> None:
+    mechanism = ckc_pin.load(name)
+    names = [info.name for info in Quantities(mechanism).infos() if not info.unavailable]
+    quantities = show(mechanism, *(name for name in names if name != "nearest_singular"))
+    points = search_singular(mechanism, 6)
+    assert points
+    for point in points:
+        shown = quantities.evaluate(point.at)
+        texts = [text for lines in shown.lines.values() for line in lines for text in line]
+        assert any("singular here" in text for text in texts)
+        assert not any("nan" in text or "e+1" in text for text in texts)
+        assert all(np.isfinite(command["matrix"]).all() for command in shown.commands if "matrix" in command)
+
+
 # --- conditioning and motors ---------------------------------------------------------------------
 
 
@@ -191,6 +208,18 @@ def test_distance_to_the_nearest_singular_configuration_of_five_bar() -> None:
     stale = quantities.evaluate(mechanism.kinematics(FIVE_BAR.sigma(q + 0.1))).lines["nearest_singular"]
     assert stale[0][1].endswith("s ago")
     quantities.show("nearest_singular", False)
+
+
+def test_long_search_is_given_up_when_it_is_hidden() -> None:
+    mechanism = ckc_pin.load("stewart")  # its search takes many seconds
+    quantities, others = show(mechanism, "nearest_singular"), set(threading.enumerate())
+    quantities.evaluate(mechanism.assembled)
+    (thread,) = set(threading.enumerate()) - others
+    time.sleep(0.5)
+    assert thread.is_alive()
+    quantities.show("nearest_singular", False)
+    thread.join(30)
+    assert not thread.is_alive()
 
 
 # --- holding torques and forces ------------------------------------------------------------------
