@@ -16,7 +16,7 @@ from ckc_pin.explore.live_run import MAX_FRAME_S, PUSH_DAMPING_RATIO, PUSH_FREQU
 from ckc_pin.explore.messages import RunReport
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.analytic.five_bar import FIVE_BAR, Array
-from tests.analytic.test_forces import generalized
+from tests.analytic.test_forces import generalized, integrate, turned
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 from tests.explore.test_saving import moved
@@ -96,7 +96,7 @@ def test_a_push_accelerates_the_grabbed_point_of_the_five_bar_by_the_spring() ->
     """The force of the first frame in the appendix's equations: the point accelerates by omega^2 (target - point)."""
     mechanism = load("five_bar")
     at = moved(mechanism, 0.5)
-    run = LiveRun(mechanism, at)
+    run = LiveRun(mechanism, at, rtol=1e-11)
     pose = at.pose
     joint = mechanism.tree.model.names.tolist().index("theta_2")
     point = np.array([0.12, 0.03, 0.0])
@@ -113,6 +113,13 @@ def test_a_push_accelerates_the_grabbed_point_of_the_five_bar_by_the_spring() ->
     q_ddot = FIVE_BAR.acceleration(q_tree, still, rho.T @ force) - FIVE_BAR.acceleration(q_tree, still, still)
     units = [generalized(1, (0.12, 0.03), lambda t, q, e=e: (e, 0.0), 0.0, q_tree) for e in np.eye(2)]
     assert_close(np.array(units) @ rho @ q_ddot, PUSH_FREQUENCY**2 * np.array([0.05, -0.02]), 1e-6)
+    # The frame's motion: the force at the joint of link 2, and its moment about the joint at the frame's start.
+    arm = turned(q_tree[0] + q_tree[1], np.array([0.12, 0.03]))
+    moment = arm[0] * push[1][1] - arm[1] * push[1][0]
+    wrench = (1, (0.0, 0.0), lambda t, q: (push[1][:2], moment))
+    q_end, v_end = integrate(np.array([0.0, MAX_FRAME_S]), [wrench], np.concatenate([q_tree, np.zeros(4)]))
+    assert_close(run.frame().q_tree, q_end[-1], 1e-9)
+    assert_close(run.frame().v_tree, v_end[-1], 1e-8)
 
 
 @pytest.mark.parametrize("name", SIX)
