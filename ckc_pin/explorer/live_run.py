@@ -365,14 +365,19 @@ class LiveRun:
                 t_last=self._times[-1],
                 message=self._message,
                 real_time=self._measure_speed(),
+                mode=self.mode,
+                motors=self._describe_motors(),
             )
 
-    @property
-    def targets(self) -> dict[str, float]:
-        """Targets by independent coordinate in mode "hold", rad or m; empty in other modes."""
-        if self.mode != "hold":
-            return {}
-        return dict(zip(self.mechanism.independent, self._target.tolist(), strict=True))
+    def _describe_motors(self) -> dict[str, float]:
+        """Return what `set_motor` has set: torques in mode "free", targets in mode "hold"."""
+        match self.mode:
+            case "free":
+                return dict(zip(self.mechanism.actuated, self._tau.tolist(), strict=True))
+            case "hold":
+                return dict(zip(self.mechanism.independent, self._target.tolist(), strict=True))
+            case _:
+                return {}
 
     def _measure_speed(self) -> float:
         if len(self._reached) < 2:
