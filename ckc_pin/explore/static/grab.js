@@ -199,7 +199,11 @@ var grab = (function () {
     const object = drag && findObject(bodies[drag.body]);
     if (!object) { return; }
     viewer.scene.updateMatrixWorld(true);
-    line.geometry.setFromPoints([object.localToWorld(drag.point.clone()), drag.target]);
+    const position = line.geometry.attributes.position;
+    [object.localToWorld(drag.point.clone()), drag.target.clone()].forEach(function (end, k) {
+      position.setXYZ(k, ...line.worldToLocal(end).toArray());
+    });
+    position.needsUpdate = true;
     line.visible = true;
     viewer.set_dirty();
   }
