@@ -22,6 +22,13 @@ VIEW = """() => {
   return [columns, [box.left, box.top, box.width, box.height]];
 }"""
 
+# Whether the line from the grabbed point to the target is visible, and its ends.
+LINE = """() => {
+  const line = viewer.scene.children.find(one => one.type === "Line"), position = line.geometry.attributes.position;
+  const ends = [0, 1].map(k => new MeshCat.THREE.Vector3().fromBufferAttribute(position, k));
+  return [line.visible, ...ends.map(end => line.localToWorld(end).toArray())];
+}"""
+
 
 class View:
     """Projection of points of the mechanism's world into the window, and back to rays, in NumPy."""
@@ -99,10 +106,13 @@ def test_dragged_body_sends_point_and_target_in_the_plane_of_the_screen(look_at,
     grabbed = (placement @ [*point, 1.0])[:3]
     np.testing.assert_allclose(drag.normal, view.direction, atol=1e-6)
     np.testing.assert_allclose(drag.target, view.meet_plane(x + 40, y - 25, grabbed, view.direction), atol=1e-6)
-    assert visit.page.evaluate("() => viewer.scene.children.find(one => one.type === 'Line').visible")
+    is_visible, *ends = visit.page.evaluate(LINE)
+    assert is_visible
+    world = view.world @ np.transpose([[*grabbed, 1.0], [*drag.target, 1.0]])
+    np.testing.assert_allclose(np.transpose(ends), world[:3], atol=1e-6)
     visit.page.mouse.up()
     assert stand_in.take(1) == [messages.Release()]
-    assert not visit.page.evaluate("() => viewer.scene.children.find(one => one.type === 'Line').visible")
+    assert not visit.page.evaluate(LINE)[0]
     assert visit.page.evaluate("() => viewer.camera.position.toArray()") == camera
 
 
@@ -263,6 +273,7 @@ def test_second_finger_ends_the_drag_and_zooms(look_at, five_bar):
     five_bar.take(0)
     visit.page.wait_for_timeout(100)
     after = View(visit)
-    assert np.linalg.norm(after.eye - view.eye) > 0.1 * np.linalg.norm(view.eye)
+    np.testing.assert_allclose(after.direction, view.direction, atol=1e-9)  # it does not turn
+    assert (after.eye - view.eye) @ view.direction > 0.1 * np.linalg.norm(view.eye)
     fingers.put("touchStart", (x, y))  # and afterwards a finger drags again
     fingers.put("touchEnd")

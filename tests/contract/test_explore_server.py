@@ -10,6 +10,7 @@ from threading import current_thread
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
@@ -309,3 +310,12 @@ def test_later_pages_get_the_newest_report_of_each_kind(serve_explorer):
         ("run", 2.0, None),
         ("branch_list", None, ["2"]),
     ]
+
+
+def test_reports_take_scalars_of_numpy():
+    command = messages.PoseReport(values={"a": np.float64(0.1)}, closure=np.float32(0.5)).to_command()
+    assert command["path"] == "pose"
+    assert command["content"]["values"] == {"a": 0.1}
+    assert command["content"]["closure"] == 0.5
+    branches = messages.BranchList(branches=[], current=np.int64(2)).to_command()
+    assert isinstance(branches["content"]["current"], int)

@@ -114,6 +114,7 @@ var explorer = (function () {
     element("dependent-section").hidden = report.coordinates.every((info) => info.is_independent);
     quantities.setNames(report.quantities.map((info) => info.name));
     report.quantities.forEach((info) => quantities.rows.get(info.name).setInfo(info));
+    element("show-section").hidden = !report.quantities.length;
     parameters.setInfos(report.parameters);
     element("change-section").hidden = !report.parameters.length;
     element("branches-section").hidden = !report.can_branch;

@@ -199,8 +199,11 @@ var grab = (function () {
     const object = drag && findObject(bodies[drag.body]);
     if (!object) { return; }
     viewer.scene.updateMatrixWorld(true);
-    const ends = [object.localToWorld(drag.point.clone()), drag.target.clone()];
-    line.geometry.setFromPoints(ends.map((point) => viewer.scene.worldToLocal(point)));  // the scene itself is turned
+    const position = line.geometry.attributes.position;
+    [object.localToWorld(drag.point.clone()), drag.target.clone()].forEach(function (end, k) {
+      position.setXYZ(k, ...line.worldToLocal(end).toArray());
+    });
+    position.needsUpdate = true;
     line.visible = true;
     viewer.set_dirty();
   }

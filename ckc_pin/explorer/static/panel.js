@@ -44,6 +44,7 @@ class SliderRow {
     this.name = name;
     this.act = act;
     this.value = 0;
+    this.shownInfo = "";
     this.hasMoved = false;
     this.isHeld = false;  // by the mouse, a finger or a key
     this.isTyping = false;
@@ -83,6 +84,7 @@ class SliderRow {
 
   move(value) {
     this.hasMoved = true;
+    this.shownInfo = "";  // The next report has to be shown even if it is the same as before.
     this.act.move(value);
   }
 
@@ -90,6 +92,14 @@ class SliderRow {
     if (!this.hasMoved) { return; }
     this.hasMoved = false;
     this.act.release();
+  }
+
+  // Shows a report's description of the value, unless that is shown already: there may be hundreds of rows.
+  update(info) {
+    const key = JSON.stringify([info, angleUnit]);
+    if (key === this.shownInfo) { return; }
+    this.shownInfo = this.isHeld ? "" : key;
+    this.setScale(info);
   }
 
   setScale(info) {
@@ -199,7 +209,7 @@ class RowList {
 
   setInfos(infos) {
     this.setNames(infos.map((info) => info.name));
-    infos.forEach((info) => this.rows.get(info.name).setScale(info));
+    infos.forEach((info) => this.rows.get(info.name).update(info));
   }
 
   forEach(action) {
