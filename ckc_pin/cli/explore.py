@@ -18,7 +18,7 @@ __all__ = ["explore"]
         "ckc explore five_bar --open",
         "ckc explore five_bar/tracking",
         "ckc explore robot.xml --out kept",
-        "ckc explore delta --set link.plate.mass=0.5",
+        "ckc explore delta --set link.plate.mass=0.5 --open",
     )
 )
 @click.argument(

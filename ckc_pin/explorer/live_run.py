@@ -25,7 +25,7 @@ from ckc_pin.errors import CkcError, InputError, NumericalError
 from ckc_pin.explorer.messages import RunReport
 from ckc_pin.explorer.saving import scene_at, write_new_texts
 from ckc_pin.mechanism.configuration import Kinematics
-from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 from ckc_pin.run.simulate import simulate
 from ckc_pin.run.simulator import Simulator
 from ckc_pin.run.state import State
@@ -119,7 +119,12 @@ class _Push:
 
 
 def list_modes(mechanism: Mechanism, scene: Scene | None) -> list[Mode]:
-    """Return the modes in which a mechanism can run: "free", "scene" with a controller, "hold" with enough motors."""
+    """Return the modes in which a mechanism can run: "free", "scene" with a controller, "hold" with enough motors.
+
+    A mechanism whose loops constrain a free root in part has none.
+    """
+    if mechanism.splits_root:
+        return []
     modes: list[Mode] = ["free"]
     if scene is not None and (scene.spec.controller is not None or scene.controller is not None):
         modes.append("scene")
@@ -193,6 +198,8 @@ class LiveRun:
         on_frame: Callable[[], None] | None = None,
     ) -> None:
         if mode not in (modes := list_modes(mechanism, scene)):
+            if not modes:
+                raise InputError(f"run: {mechanism.name}: {CONSTRAINED_IN_PART}")
             reason = "there is no controller" if mode == "scene" else _explain_no_hold(mechanism, scene)
             raise InputError(f"run: mode {mode!r}: {reason}; choose {' or '.join(map(repr, modes))}")
         self.mode, self._on_frame = mode, on_frame
@@ -315,9 +322,10 @@ class LiveRun:
             self._shown = max(bisect_right(self._times, t + 1e-9) - 1, 0)
 
     def stop(self) -> None:
-        """End the run. A frame that is being computed is completed by the run's thread and then dropped."""
+        """End the run, and a step that is being computed within 0.05 s."""
         with self._change:
             self._is_stopped = True
+            self._simulator.cancel()
             self._change.notify_all()
 
     def _truncate(self) -> None:
@@ -328,6 +336,7 @@ class LiveRun:
         self._knots = [*(one for one in self._knots if one[0] < t), (t, desired)]
         self._desired = desired
         was_stopped = self._is_stopped
+        self._simulator.cancel()
         self._must_restore, self._is_stopped, self._message = True, False, ""
         if was_stopped and self._has_thread:
             self.start()
@@ -441,9 +450,9 @@ class LiveRun:
         return _Frame(number, reached, simulator.tau, push, desired), _Input(state.t, acting, tau), moved
 
     def _store(self, frame: _Frame, step_input: _Input, moved: bool) -> float:
-        """Store a frame and return its duration, s: 0 if the run has been rewound in the meantime."""
+        """Store a frame and return its duration, s: 0 if the run has been rewound or stopped in the meantime."""
         with self._change:
-            if self._must_restore:
+            if self._must_restore or self._is_stopped:
                 return 0.0
             if not step_input.equals(self._inputs[-1]):
                 self._inputs[-1:] = (

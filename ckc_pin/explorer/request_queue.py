@@ -15,7 +15,10 @@ Positions = (Drag, GoTo, Move, Rewind, SetMotor, SetParameter)
 
 
 class RequestQueue:
-    """Requests in their order, and functions to call between them. Of consecutive positions of one gesture only the newest is kept."""
+    """Requests in their order, and functions to call between them.
+
+    Of consecutive positions of one gesture only the newest is kept.
+    """
 
     def __init__(self) -> None:
         self._requests: deque[Request | Callable[[], None]] = deque()

@@ -58,7 +58,7 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.commands import Command
-from ckc_pin.view.drawing import estimate_reach, set_camera
+from ckc_pin.view.drawing import estimate_reach, motion_extent, set_camera
 from ckc_pin.view.geometry import compute_placements
 
 __all__ = ["Session"]
@@ -118,7 +118,10 @@ class Session:
     def draw(self) -> None:
         """Draw the mechanism from nothing and report everything about it."""
         pose = compute_placements(self.mechanism, self.at.q_tree[None])
-        for command in set_camera(self.mechanism, estimate_reach(self.mechanism, pose)):
+        # Half of the room that a motion might need: pages can zoom out, and bodies should be large enough to grab.
+        bounds = zip(motion_extent(self.mechanism, [pose]), estimate_reach(self.mechanism, pose), strict=True)
+        low, high = (0.5 * (present + reach) for present, reach in bounds)
+        for command in set_camera(self.mechanism, (low, high)):
             self._send(command)
         self._draw_bodies()
         self.quantities = self._make_quantities(SHOWN_AT_FIRST)

@@ -89,7 +89,7 @@ class Simulator(HasSummary):
     from this one's state, equally accurate, but with other steps.
 
     A simulator executes one call at a time. Calls from another thread or from an event function in the meantime raise
-    InputError. Several simulators in several threads do not wait for each other.
+    InputError, except `cancel`. Several simulators in several threads do not wait for each other.
 
     Examples
     --------
@@ -293,13 +293,24 @@ class Simulator(HasSummary):
                     self._wrenches[force.name] = value
             return self._advance(effort, until=until, of_motors=tau is not None)
 
+    def cancel(self) -> None:
+        """End the step that another thread is executing within 0.05 s, unless a Python function takes longer.
+
+        That step returns the state that it has reached.
+        """
+        self._is_cancelled = True
+
     def _advance(self, effort: Array | None, *, until: float, of_motors: bool) -> State:
         """Advance to a time (s) with a constant effort: u or, with `of_motors`, tau; None if the controller acts."""
+        self._is_cancelled = False
         try:
             while True:
                 result = self._loop.step(effort, until, PAUSE_S, torques=of_motors)
                 if result is None or result[0].reason != StopReason.PAUSE:
                     break
+                if self._is_cancelled:
+                    self._state = self._read_state()
+                    return self._state
         except BaseException:  # An event function may raise, and so does Ctrl-C.
             self._state = self._read_state()
             raise

@@ -1,4 +1,4 @@
-"""The explorer as a person uses it: random drags of real mechanisms in Chromium, runs, two pages, ten minutes in short."""
+"""The explorer as a person uses it: random drags of real mechanisms in Chromium, runs, two pages, random input."""
 
 from __future__ import annotations
 

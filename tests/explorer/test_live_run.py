@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ckc_pin import InputError, Mechanism, Run, Scene, load, load_scene, simulate
+from ckc_pin import Force, InputError, Mechanism, Run, Scene, load, load_scene, simulate
 from ckc_pin.explorer import live_run
 from ckc_pin.explorer.live_run import MAX_FRAME_S, PUSH_DAMPING_RATIO, PUSH_FREQUENCY, LiveFrame, LiveRun, list_modes
 from ckc_pin.explorer.messages import RunReport
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.analytic.five_bar import FIVE_BAR, Array
-from tests.analytic.test_forces import generalized
+from tests.analytic.test_forces import generalized, integrate, turned
 from tests.conftest import assert_close
 from tests.contract.helpers.command import ckc
 from tests.explorer.test_saving import moved
@@ -73,7 +74,7 @@ def assert_exported(run: LiveRun, shown: list[LiveFrame], folder: Path, toleranc
 # --- pushes --------------------------------------------------------------------------------------
 
 
-def test_a_push_is_the_damped_spring_of_a_block_held_over_each_frame() -> None:
+def test_a_push_is_the_damped_spring_of_a_block_with_zero_order_hold() -> None:
     """Exact motion of 2 kg under the force of the last frame, in NumPy."""
     block = Mechanism.from_urdf(BLOCK, gravity=[0.0, 0.0, 0.0])
     run = LiveRun(block, block.assembled, rtol=1e-11, formulation="dae")
@@ -95,7 +96,7 @@ def test_a_push_accelerates_the_grabbed_point_of_the_five_bar_by_the_spring() ->
     """The force of the first frame in the appendix's equations: the point accelerates by omega^2 (target - point)."""
     mechanism = load("five_bar")
     at = moved(mechanism, 0.5)
-    run = LiveRun(mechanism, at)
+    run = LiveRun(mechanism, at, rtol=1e-11)
     pose = at.pose
     joint = mechanism.tree.model.names.tolist().index("theta_2")
     point = np.array([0.12, 0.03, 0.0])
@@ -112,6 +113,13 @@ def test_a_push_accelerates_the_grabbed_point_of_the_five_bar_by_the_spring() ->
     q_ddot = FIVE_BAR.acceleration(q_tree, still, rho.T @ force) - FIVE_BAR.acceleration(q_tree, still, still)
     units = [generalized(1, (0.12, 0.03), lambda t, q, e=e: (e, 0.0), 0.0, q_tree) for e in np.eye(2)]
     assert_close(np.array(units) @ rho @ q_ddot, PUSH_FREQUENCY**2 * np.array([0.05, -0.02]), 1e-6)
+    # The frame's motion: the force at the joint of link 2, and its moment about the joint at the frame's start.
+    arm = turned(q_tree[0] + q_tree[1], np.array([0.12, 0.03]))
+    moment = arm[0] * push[1][1] - arm[1] * push[1][0]
+    wrench = (1, (0.0, 0.0), lambda t, q: (push[1][:2], moment))
+    q_end, v_end = integrate(np.array([0.0, MAX_FRAME_S]), [wrench], np.concatenate([q_tree, np.zeros(4)]))
+    assert_close(run.frame().q_tree, q_end[-1], 1e-9)
+    assert_close(run.frame().v_tree, v_end[-1], 1e-8)
 
 
 @pytest.mark.parametrize("name", SIX)
@@ -161,7 +169,7 @@ def test_an_unpushed_run_is_the_command_run_of_its_scene_to_the_bit(name: str, t
 # --- motors --------------------------------------------------------------------------------------
 
 
-def test_torques_of_sliders_are_held_and_exported(tmp_path: Path) -> None:
+def test_torques_of_sliders_are_limited_and_exported(tmp_path: Path) -> None:
     run = of_scene("five_bar/tracking", "free", {"controller.torque_limit": 0.5}, rtol=1e-10)
     shown = frames(run, 5)
     run.set_motor("theta_1", 0.3)
@@ -427,3 +435,29 @@ def test_an_error_of_a_function_stops_the_run() -> None:
     frames(run, 10)
     assert run.report().state == "stopped"
     assert "ValueError: no more" in run.report().message
+
+
+def test_stop_ends_a_long_step_of_the_thread() -> None:
+    """A force with 20 kHz makes a frame last for minutes."""
+    shake = Force("link_2", lambda t, terms: [1e-3 * np.sin(1e6 * t), 0.0, 0.0])
+    scene = load_scene("five_bar/swing").with_control(None, [], [shake])
+    mechanism = load_scene_mechanism(scene)
+    run = LiveRun(mechanism, mechanism.assembled, scene, rtol=1e-12)
+    run.start()
+    time.sleep(0.3)
+    began = time.monotonic()
+    run.stop()
+    while any(thread.name == "ckc_pin live run" for thread in threading.enumerate()):
+        assert time.monotonic() < began + 5.0
+        time.sleep(0.01)
+    assert run.report().t == 0.0
+
+
+def test_a_mechanism_with_a_partly_constrained_root_has_no_modes() -> None:
+    body = BLOCK.partition('<link name="block">')[2].partition("</link>")[0]
+    urdf = f'<robot name="b"><link name="body">{body}</link></robot>'
+    ball = {"name": "ball", "type": "point", "frame_a": "body", "frame_b": "world"}
+    mechanism = Mechanism.from_urdf(trees=[{"file": urdf, "root": "free"}], loops=[ball])
+    assert list_modes(mechanism, None) == []
+    with pytest.raises(InputError, match="run: b: the loops constrain a free root in part"):
+        LiveRun(mechanism, mechanism.assembled)
