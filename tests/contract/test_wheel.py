@@ -30,7 +30,7 @@ def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> Non
     new = {file.name for file in code if file.parts[1:3] == ("cli", "new_files")}
     assert new == {"NAME.urdf", "mechanism.toml", "default.scene.toml"}
     code = {file for file in code if file.name not in new}
-    for room in ("explore", "view"):
+    for room in ("explorer", "view"):
         static = {file.name for file in code if file.parts[1:3] == (room, "static")}
         assert static == {path.name for path in (ROOT / "ckc_pin" / room / "static").iterdir()}
     assert {file.suffix for file in code} <= {".py", ".pyi", ".typed", ".html", ".js", ".css"}
