@@ -20,7 +20,7 @@ Subpackages, bottom to top; a module imports only from subpackages below its own
 `linear`, `sensitivity`      linear models and stability; derivatives of runs, Floquet multipliers
 `ensembles`                  many runs with different parameters
 `formats`, `analysis`        import and export; checks, singularity maps, work-precision reports
-`view`, `explore`, `cli`     figures and 3-D playback; the explorer in the browser; the command `ckc`
+`view`, `explorer`, `cli`    figures and 3-D playback; the explorer in the browser; the command `ckc`
 ============================ ==========================================================================
 
 docs/architecture.md describes them, and what happens in a call of `simulate`.
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from ckc_pin.dynamics.terms import Terms, terms
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
+    from ckc_pin.explorer.explore import Explorer, explore
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
@@ -74,6 +75,7 @@ __all__ = [
     "CkcError",
     "Controller",
     "Event",
+    "Explorer",
     "Floquet",
     "Force",
     "GainLocus",
@@ -99,6 +101,7 @@ __all__ = [
     "as_ivp",
     "check",
     "ensemble",
+    "explore",
     "floquet",
     "gain_locus",
     "inverse_dynamics",
@@ -122,6 +125,7 @@ MODULES = {
     "CkcError": "errors",
     "Controller": "control.controllers",
     "Event": "run.events",
+    "Explorer": "explorer.explore",
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
     "GainLocus": "linear.locus",
@@ -147,6 +151,7 @@ MODULES = {
     "as_ivp": "run.ivp",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
+    "explore": "explorer.explore",
     "floquet": "sensitivity.floquet",
     "gain_locus": "linear.locus",
     "inverse_dynamics": "run.inverse",
@@ -158,8 +163,8 @@ MODULES = {
     "terms": "dynamics.terms",
 }
 ROOMS = (
-    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "formats", "kinematics", "linear",
-    "mechanism", "native", "run", "scene", "sensitivity", "view",
+    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats", "kinematics",
+    "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
 )  # fmt: skip
 
 
@@ -270,12 +275,15 @@ def singularity_map(
     over: Sequence[str] | None = None,
     point: str | None = None,
     cells: int = 200,
+    loci: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> SingularityMap:
     """Compute the workspace and the singular configurations of a mechanism: `ckc_pin.analysis.map.singularity_map`."""
     from ckc_pin.analysis.map import singularity_map as compute
 
-    return compute(mechanism, scene=scene, space=space, over=over, point=point, cells=cells, progress=progress)
+    return compute(
+        mechanism, scene=scene, space=space, over=over, point=point, cells=cells, loci=loci, progress=progress
+    )
 
 
 def symbolic(mechanism: Mechanism | str | Path) -> Symbolic:

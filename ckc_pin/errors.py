@@ -48,7 +48,17 @@ def _escape(letter: str) -> str:
 
 
 class MechanismError(CkcError):
-    """The mechanism cannot exist as described."""
+    """The mechanism cannot exist as described.
+
+    Attributes
+    ----------
+    q_tree : dict of str to float, or None
+        If its loops cannot be closed: the configuration nearest to closed ones that was reached, by coordinate.
+    """
+
+    def __init__(self, message: str, *, q_tree: Mapping[str, float] | None = None) -> None:
+        super().__init__(message)
+        self.q_tree = q_tree
 
 
 class InputError(CkcError, ValueError):

@@ -23,6 +23,7 @@ INTRODUCTION = """Dynamics and control of closed kinematic chains.
 Begin with
   ckc list                                     list shipped mechanisms and scenes
   ckc check five_bar                           freedoms, partition, assembled configuration
+  ckc explore five_bar                         drag the mechanism in the browser, loops closed
   ckc run five_bar/tracking --out runs/first   simulate, and save run.npz in the folder
   ckc play runs/first                          play the run in the browser
   ckc plot runs/first --out figures            draw figures of the run
@@ -41,6 +42,7 @@ COMMANDS = {
     "list": "inspection:list_",
     "keys": "inspection:keys",
     "check": "inspection:check",
+    "explore": "explore:explore",
     "terms": "inspection:terms",
     "compile": "inspection:compile_",
     "run": "runs:run",

@@ -188,6 +188,11 @@ class BodyForce:
         """Whether the values are given in the world's axes instead of the frame's."""
         return self.spec.axes == "world"
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether its table has constant values."""
+        return self.over_time is not None and self.spec.file is None
+
     def fixed(self, values: Array) -> BodyForce:
         """Return this force with constant values, shape (6,)."""
         return BodyForce(self.spec, self.frame, _constant(values))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
@@ -11,8 +12,10 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.kinematics.closing import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Assembly, close_loops, find_nearby
+from ckc_pin.kinematics.continuation import same_branch
 from ckc_pin.kinematics.loop_types import describe_locking_loops, list_closing_types
-from ckc_pin.kinematics.sigma import newton, sigma
+from ckc_pin.kinematics.sigma import follow_sigma, newton, sigma
+from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.couplings import coefficients_of, coupled_joints, curve_of
 from ckc_pin.mechanism.linkage import Linkage
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -22,7 +25,7 @@ from ckc_pin.mechanism.rank import count_freedoms
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.warnings import find_model_warnings
 
-__all__ = ["assemble_mechanism"]
+__all__ = ["assemble_mechanism", "open_loops", "reassemble"]
 
 
 def assemble_mechanism(
@@ -60,6 +63,92 @@ def assemble_mechanism(
             mechanism.warnings.append(f"the loops leave no freedom (d = 0): {locking}")
         mechanism.warnings += find_model_warnings(mechanism)
         return mechanism
+
+
+def open_loops(spec: MechanismSpec, sources: Sources, q_tree: Mapping[str, float]) -> tuple[Mechanism, Mechanism]:
+    """Return a mechanism whose loops cannot be closed: as a tree without its loops, and with open loops.
+
+    The first can be moved like any mechanism. The second is for display only: its terms exist, but its loops are open.
+
+    Parameters
+    ----------
+    spec, sources : MechanismSpec, Sources
+    q_tree : mapping
+        Where both stand, by coordinate, such as `MechanismError.q_tree`.
+    """
+    spec = msgspec.structs.replace(spec, independent=None, q_guess=dict(q_tree))
+    as_tree = assemble_mechanism(msgspec.structs.replace(spec, loop=[], coupling=[]), sources)
+    linkage = Linkage(spec, sources, None)
+    residuals = linkage.closure.largest_residuals(linkage.closure.phi(Pose(linkage.tree, linkage.closure.anchors,
+                                                                           as_tree.q_tree)))  # fmt: skip
+    with one_blas_thread():
+        opened = _create_mechanism(linkage, Assembly(as_tree.q_tree, max(residuals.values(), default=0.0), residuals))
+    return as_tree, opened
+
+
+def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tuple[Mechanism, Kinematics]:
+    """Assemble a mechanism with other parameter values on the branch of a closed configuration, at the same q.
+
+    The residual phi of the configuration in the new mechanism is reduced to zero along a straight line, by z alone. If
+    this is not possible, all coordinates move as little as possible. The new mechanism's assembled configuration
+    follows from the old one in the same way, or is the configuration if that fails.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    overrides : mapping
+        Parameter values by name, with those that the mechanism has already.
+    at : Kinematics
+        A closed configuration of the mechanism, or of it with other parameter values.
+
+    Returns
+    -------
+    Mechanism, Kinematics
+        The new mechanism, with the same independent coordinates, and its configuration.
+
+    Raises
+    ------
+    InputError, MechanismError
+        Invalid values; or the loops cannot be closed near the configuration on its branch.
+    """
+    home = mechanism.tree.to_coordinates(mechanism.q_tree)
+    positions = {name: float(home[mechanism.tree.index[name]]) for name in mechanism.prescribed}
+    linkage = Linkage(mechanism.spec, mechanism.sources, overrides, positions)
+    with one_blas_thread():
+        here = _close_on_branch(linkage, at, mechanism.tolerance)
+        try:
+            assembled = _close_on_branch(linkage, mechanism.assembled, mechanism.tolerance)
+        except MechanismError:
+            assembled = here
+        rebuilt = _create_mechanism(linkage, assembled, mechanism.independent)
+        rebuilt.warnings += find_model_warnings(rebuilt)
+    return rebuilt, rebuilt.kinematics(here.q_tree)
+
+
+def _close_on_branch(linkage: Linkage, at: Kinematics, tolerance: float) -> Assembly:
+    """Close the loops of a linkage near a closed configuration of another one, on its branch (MechanismError)."""
+    start, rounded = (
+        Kinematics(linkage.tree, linkage.closure, at.partition, at.q_tree),
+        ROUNDED_TOLERANCE * linkage.size,
+    )
+    moved = follow_sigma(start, np.zeros(len(at.partition.q)), 0.0, tolerance, anywhere=False)
+    closed = _measure(linkage, moved.at)
+    if moved.verdict != "converged" or closed.residual > rounded:
+        free, exact = np.ones(linkage.tree.n), EXACT_TOLERANCE * linkage.size
+        closed = close_loops(linkage.tree, linkage.closure, at.q_tree, free, exact, restarts=0, rounded=rounded)
+    if closed.residual > rounded:
+        loop, miss = max(closed.largest_residuals.items(), key=lambda item: item[1])
+        raise MechanismError(f"not closed: nearest miss {miss:.3g} m at loop {loop}")
+    end = Kinematics(linkage.tree, linkage.closure, at.partition, closed.q_tree)
+    if not same_branch(at, end) or linkage.closure.reversed_hinges(end.pose):
+        raise MechanismError("the loops close on another assembly branch only, behind a singular configuration")
+    return closed
+
+
+def _measure(linkage: Linkage, at: Kinematics) -> Assembly:
+    """Return a configuration with its residuals."""
+    residuals = linkage.closure.largest_residuals(at.phi)
+    return Assembly(at.q_tree, float(np.abs(at.phi).max(initial=0.0)), residuals)
 
 
 def _prescribe(linkage: Linkage, free_linkage: Linkage, free: Mechanism, prescribed: Mapping[str, float]) -> Mechanism:
@@ -168,10 +257,8 @@ def _restore_guess(linkage: Linkage, mechanism: Mechanism) -> Mechanism:
     is_beyond_stop = np.any(_excess(linkage, tree.to_coordinates(closed.at.q_tree)) > accepted)
     if not closed.converged or is_beyond_stop or linkage.closure.reversed_hinges(closed.at.pose):
         return mechanism
-    phi = closed.at.phi
-    assembly = Assembly(closed.at.q_tree, float(np.abs(phi).max(initial=0.0)), linkage.closure.largest_residuals(phi))
     try:
-        return _create_mechanism(linkage, assembly, mechanism.independent)
+        return _create_mechanism(linkage, _measure(linkage, closed.at), mechanism.independent)
     except MechanismError:  # phi_z is singular at the guess
         return mechanism
 
@@ -186,7 +273,8 @@ def _assemble(linkage: Linkage, start: Array) -> Assembly:
     scale = linkage.size
     closed = _close_near(linkage, start)
     if closed.residual > ROUNDED_TOLERANCE * scale:
-        raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}")
+        nearest = linkage.tree.named(linkage.tree.to_coordinates(closed.q_tree))
+        raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}", q_tree=nearest)
     reversed_ = linkage.closure.reversed_hinges(Pose(linkage.tree, linkage.closure.anchors, closed.q_tree))
     if reversed_:
         raise MechanismError(

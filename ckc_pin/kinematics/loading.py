@@ -20,7 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import Overrides
 from ckc_pin.mechanism.spec import MechanismSpec
 
-__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "check_overrides", "load"]
+__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "check_overrides", "load", "read_spec"]
 
 
 class MechanismCache:
@@ -160,8 +160,13 @@ def build(
 def _build(
     text: str, sources: Sources, overrides: Overrides | None, prescribed: Mapping[str, float | None] | None
 ) -> Mechanism:
-    data = read_toml(text, sources.name)
-    join_dotted_keys(data, "q_guess")
-    spec = convert(data, MechanismSpec, sources.name)
+    spec = read_spec(text, sources.name)
     with sources.prefix_errors():
         return assemble_mechanism(spec, sources, overrides, prescribed)
+
+
+def read_spec(text: str, name: str) -> MechanismSpec:
+    """Return the contents of a mechanism file from its text (InputError). `name` is the file's, for messages."""
+    data = read_toml(text, name)
+    join_dotted_keys(data, "q_guess")
+    return convert(data, MechanismSpec, name)

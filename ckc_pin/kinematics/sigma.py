@@ -323,20 +323,26 @@ def _least_squares(at: Kinematics, w: Array | float, tolerance: float) -> Kinema
 # --- assembly branches ---------------------------------------------------------------------------
 
 
-def assembly_branches(mechanism: Mechanism) -> list[Kinematics]:
-    """List the assembly branches at the assembled q, the assembled one first, by a search from random z.
+def assembly_branches(mechanism: Mechanism, at: Kinematics | None = None) -> list[Kinematics]:
+    """List the assembly branches at the q of a closed configuration, this one first, by a search from random z.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    at : Kinematics, optional
+        The configuration. Default: as assembled.
 
     Raises
     ------
     InputError
         The mechanism is too large for a search from random starts.
     """
-    at = mechanism.assembled
+    at = at or mechanism.assembled
     z = mechanism.partition.z
     if len(z) > MAX_BRANCH_COORDINATES or not mechanism.tree.is_euclidean:
         raise InputError(
             f"{mechanism.name}: branches are listed for mechanisms with at most {MAX_BRANCH_COORDINATES} dependent "
-            f"joints; this one has {len(z)}"
+            f"joints{'' if mechanism.tree.is_euclidean else ' and without a free root'}; this one has {len(z)}"
         )
     random = np.random.default_rng(0)
     spread = np.where(mechanism.tree.in_metres[z], mechanism.size, np.pi)

@@ -22,6 +22,7 @@ from ckc_pin.native.plant import LOST_RANK
 __all__ = [
     "StaticBalance",
     "balance_at_rest",
+    "closest_torques",
     "compute_velocity_basis",
     "has_unbalanced_force",
     "orthonormal_null_space",
@@ -47,6 +48,8 @@ class StaticBalance:
         Coordinates that are pushed into a stop.
     unloaded_stops : int array
         Coordinates that are at a stop without a force on it.
+    passive_force : (n,) array
+        Generalized force of loaded stops and dry friction on the tree.
     uses_friction : bool
         Whether the motors are not sufficient without dry friction.
     """
@@ -54,6 +57,7 @@ class StaticBalance:
     tau: Array
     loaded_stops: IntArray
     unloaded_stops: IntArray
+    passive_force: Array
     uses_friction: bool
 
 
@@ -88,10 +92,12 @@ def balance_at_rest(state: Terms, actuation: Actuation, *, has_friction: bool) -
             first_error = error
             continue
         residual = velocities.T @ (state.h_tree - mechanism.motors.force(tau) - friction)
-        stop_forces = -stop_sides[loaded] * np.linalg.lstsq(velocities[loaded].T, residual, rcond=RANK_TOLERANCE)[0]
+        passive = friction.copy()
+        passive[loaded] += np.linalg.lstsq(velocities[loaded].T, residual, rcond=RANK_TOLERANCE)[0]
+        stop_forces = -stop_sides[loaded] * (passive - friction)[loaded]
         scale = np.abs(velocities.T) @ (np.abs(state.h_tree) + np.abs(mechanism.motors.force(tau)))
         if np.all(stop_forces > FORCE_TOLERANCE * scale.max(initial=0.0)):  # a stop cannot pull
-            return StaticBalance(tau, loaded, np.setdiff1d(at_stop, loaded), bool(friction.any()))
+            return StaticBalance(tau, loaded, np.setdiff1d(at_stop, loaded), passive, bool(friction.any()))
     raise first_error or InputError(
         f"{mechanism.name}: too many joints are at stops to find out which stops are loaded"
     )
@@ -155,7 +161,7 @@ def _balance_along(state: Terms, tangent: Array, actuation: Actuation, *, has_fr
     """
     mechanism, zeros = state.mechanism, np.zeros(state.mechanism.n)
     turns, max_friction = mechanism.motors.transmission, mechanism.joints.friction
-    tau = _allocate_along(state, tangent, turns, actuation.limit, actuation.weights, actuation.preload)
+    tau = closest_torques(state, tangent, actuation)
     if not has_unbalanced_force(state, turns.T @ tau, tangent):
         return tau, zeros
     rubbing = np.flatnonzero(max_friction)
@@ -173,6 +179,20 @@ def _balance_along(state: Terms, tangent: Array, actuation: Actuation, *, has_fr
         if not has_unbalanced_force(state, turns.T @ tau + friction, tangent):
             return tau, friction
     raise InputError(f"{mechanism.name}: {_explain_imbalance(state, tangent, actuation)}")
+
+
+def closest_torques(state: Terms, tangent: Array, actuation: Actuation) -> Array:
+    """Return the motor torques within limits that balance a state at rest as well as possible along some velocities.
+
+    Parameters
+    ----------
+    state : Terms
+        At rest.
+    tangent : (n, k) array
+        Basis of the velocities.
+    """
+    turns = state.mechanism.motors.transmission
+    return _allocate_along(state, tangent, turns, actuation.limit, actuation.weights, actuation.preload)
 
 
 def _allocate_along(state: Terms, tangent: Array, turns: Array, limit: Array, weights: Array, preload: Array) -> Array:

@@ -480,11 +480,26 @@ class Loop:
         Advance to a time. `final`: the motion ends there; `pause`, `budget`: seconds until the loop returns.
         """
 
+    def set_wrench(
+        self, force: int, wrench: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)]
+    ) -> None:
+        """Apply another constant wrench from now on."""
+
+    def move_desired(
+        self, end: float, x: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)]
+    ) -> bool:
+        """
+        Move the controller's desired q to x until `end`. False if it has none that can be replaced.
+        """
+
+    def torques(self) -> numpy.typing.NDArray[numpy.float64] | None:
+        """Return the motor torques at the present state; None if there are none."""
+
     def step(
-        self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, torques: bool
+        self, u: numpy.typing.NDArray[numpy.float64] | None, until: float, pause: float, *, torques: bool
     ) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None] | None:
         """
-        Hold u, or motor torques, and advance. Return the stop and `state` (None at a pause); None if a number is not finite.
+        Hold u, or motor torques, and advance; with None the controller acts. Return the stop and `state` (None at a pause); None if a number is not finite.
         """
 
     def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None:

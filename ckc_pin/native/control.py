@@ -136,12 +136,22 @@ def force_tables(
     forces: Sequence[BodyForce], call: Callable[[BodyForce], Callable[..., Any]] | None = None
 ) -> list[dict[str, Any]]:
     """Return the tables of forces on links. `call` wraps those that are functions of the state."""
-    return [
-        {"joint": force.frame.joint, "origin": force.frame.translation, "in_world": force.in_world,
-         "axes": np.asfortranarray(force.frame.rotation),
-         **({"function": call(force)} if force.over_time is None and call else {"values": _spline(force.over_time)})}
-        for force in forces
-    ]  # fmt: skip
+    tables = []
+    for force in forces:
+        table: dict[str, Any] = {
+            "joint": force.frame.joint,
+            "origin": force.frame.translation,
+            "in_world": force.in_world,
+            "axes": np.asfortranarray(force.frame.rotation),
+        }
+        if force.over_time is None and call:
+            table["function"] = call(force)
+        elif force.is_constant and force.over_time is not None:
+            table["constant"] = force.over_time(0.0)[0]
+        else:
+            table["values"] = _spline(force.over_time)
+        tables.append(table)
+    return tables
 
 
 def actuation_table(actuation: Actuation) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from ckc_pin.view.links import SLIDER_LENGTH, Bar, Plate, compute_rank, find_gro
 from ckc_pin.view.visuals import Colour, Surface, Visual, load_surface, read_visuals
 
 __all__ = ["GHOST", "SOLID", "TRANSLUCENT", "Appearance", "body_path", "draw_bodies", "draw_gaps", "draw_loop_frames",
-           "escape_path", "find_missing_meshes", "gap_path"]  # fmt: skip
+           "escape_path", "find_missing_meshes", "gap_path", "place_bodies", "stretch_gaps"]  # fmt: skip
 
 BASE_COLOUR: Colour = (0.45, 0.47, 0.50)
 FRAME_A_COLOUR: Colour = (0.10, 0.10, 0.10)
@@ -41,16 +41,18 @@ LINK_COLOURS: tuple[Colour, ...] = (  # the palette of Okabe and Ito
 ROD_RADIUS = 0.03
 SLIDER_WIDTH = 0.06
 GAP_ROD_RADIUS = 0.008
+MIN_GAP_LENGTH = 1e-9  # m; a vector of length zero has no direction
 FRAME_A_RADIUS, FRAME_B_RADIUS = 0.018, 0.03
 THICKNESSES = 7  # of plates
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Opacity of a mechanism, and one colour for all of its links if they do not keep their own."""
+    """Opacity of a mechanism, and one colour for all links if they do not keep their own. A ghost has no base."""
 
     opacity: float = 1.0
     colour: Colour | None = None
+    is_ghost: bool = False
 
     def create_material(self, colour: Colour, on_top: bool = False) -> dict[str, Any]:
         """Return the material of an object of some colour."""
@@ -59,7 +61,7 @@ class Appearance:
 
 SOLID = Appearance()
 TRANSLUCENT = Appearance(opacity=0.4)  # of all runs but the first
-GHOST = Appearance(opacity=0.22, colour=(0.25, 0.27, 0.30))  # of the desired pose
+GHOST = Appearance(opacity=0.22, colour=(0.25, 0.27, 0.30), is_ghost=True)  # of the desired pose
 
 
 def escape_path(name: str) -> str:
@@ -88,7 +90,7 @@ def draw_bodies(
         Folder of the mesh files, if it is not the mechanism's own.
     """
     folder = meshes or mechanism.sources.folder
-    visuals = [visual for visual in read_visuals(mechanism) if visual.joint or appearance is not GHOST]
+    visuals = [visual for visual in read_visuals(mechanism) if visual.joint or not appearance.is_ghost]
     joints = range(mechanism.tree.model.njoints - 1)
     palette = [BASE_COLOUR, *(LINK_COLOURS[k % len(LINK_COLOURS)] for k in joints)]
     urdf_colours = {visual.joint: visual.colour for visual in reversed(visuals) if visual.joint}
@@ -103,6 +105,16 @@ def draw_bodies(
             drawn_joints.add(visual.joint)
             yield command
     yield from _draw_links(mechanism, root, poses, drawn_joints, palette, appearance)
+
+
+def place_bodies(mechanism: Mechanism, root: str, poses: Placements) -> list[Command]:
+    """Return the commands that move all bodies to the first of some poses."""
+    return [
+        commands.set_transform(
+            body_path(mechanism, root, joint), homogeneous(poses.rotation[0, joint], poses.translation[0, joint])
+        )
+        for joint in range(1, mechanism.tree.model.njoints)
+    ]
 
 
 def find_missing_meshes(mechanism: Mechanism, meshes: Path | None = None) -> list[str]:
@@ -135,7 +147,7 @@ def _draw_links(
     def draw_bars(name: str, bars: Sequence[Bar], ratio: float) -> Iterator[Command]:
         base_colour = RAIL_COLOUR if name == "rail" else GROUND_COLOUR
         for k, bar in enumerate(bars):
-            if bar.joint not in drawn and not (appearance is GHOST and not bar.joint):
+            if bar.joint not in drawn and not (appearance.is_ghost and not bar.joint):
                 path = f"{body_path(mechanism, root, bar.joint)}/{name}:{k}"
                 placement, size = _place_cylinder(bar.start, bar.end), [ratio * radius, bar.length]
                 yield commands.draw_primitive(path, "cylinder", size, placement, material(bar.joint, base_colour))
@@ -165,7 +177,7 @@ def _draw_links(
             end = slider.centre + slider.direction
             placement = _place_cylinder(slider.centre - slider.direction, end)
             yield commands.draw_primitive(path, "box", size, placement, material(slider.joint))
-    if 0 not in drawn and appearance is not GHOST:
+    if 0 not in drawn and not appearance.is_ghost:
         ground, posts = find_ground(mechanism, shapes, poses, radius)
         yield from draw_bars("rod", [shape for shape in ground if isinstance(shape, Bar)], 1.0)
         yield from draw_plates([shape for shape in ground if isinstance(shape, Plate)])
@@ -236,3 +248,30 @@ def draw_gaps(mechanism: Mechanism, root: str, appearance: Appearance) -> Iterat
         path = gap_path(root, loop)
         yield commands.draw_primitive(f"{path}/way/rod", "cylinder", [radius, 1.0], middle, material)
         yield commands.draw_primitive(f"{path}/end/ball", "sphere", [2.5 * radius], np.eye(4), material)
+
+
+def stretch_gaps(
+    mechanism: Mechanism, root: str, poses: Placements, offsets: Mapping[str, Array]
+) -> dict[str, dict[str, Array]]:
+    """Return how each loop's rod and ball of `draw_gaps` are placed so that the rod reaches from frame B to an offset.
+
+    Parameters
+    ----------
+    offsets : mapping of str to (m, 3) array
+        By loop, in the world's axes, m.
+
+    Returns
+    -------
+    dict of str to dict of str to array
+        By path, "position" (m, 3), and for rods "quaternion" (m, 4) and "scale" (m, 3).
+    """
+    frames = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
+    z, placements = np.array([0.0, 0.0, 1.0]), {}
+    for loop, vectors in offsets.items():
+        start = poses.point_positions(frames[loop].joint, frames[loop].translation)
+        lengths = np.maximum(np.linalg.norm(vectors, axis=1), MIN_GAP_LENGTH)
+        scale = np.column_stack([np.ones((len(vectors), 2)), lengths])
+        rotations = np.array([pin.Quaternion.FromTwoVectors(z, vector).coeffs() for vector in vectors])
+        placements[f"{gap_path(root, loop)}/way"] = {"position": start, "quaternion": rotations, "scale": scale}
+        placements[f"{gap_path(root, loop)}/end"] = {"position": start + vectors}
+    return placements

@@ -18,7 +18,14 @@ from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 from ckc_pin.view import bodies, commands
-from ckc_pin.view.arrows import compute_arrow_scales, compute_arrows, create_arrow_tracks, draw_arrows, forces_path
+from ckc_pin.view.arrows import (
+    compute_arrow_scales,
+    compute_arrows,
+    create_arrow_tracks,
+    draw_arrows,
+    forces_path,
+    format_arrow_scales,
+)
 from ckc_pin.view.commands import Command, Track
 from ckc_pin.view.geometry import (
     Placements,
@@ -41,7 +48,6 @@ KEYFRAMES_PER_SECOND = 60  # of playback, if the run has that many output times
 MIN_KEYFRAMES = 2000  # of a run, so that it can be played slowly
 MAX_KEYFRAMES = 20_000  # of a run, for the browser's memory
 TRACE_COLOUR: Colour = (0.25, 0.25, 0.28)
-MIN_GAP_LENGTH = 1e-9  # m; a vector of length zero has no direction
 
 WORLD = "/world"
 FIELD_OF_VIEW_DEG = 40.0
@@ -125,9 +131,8 @@ def _add_forces(
         root = _run_path(runs, k)
         drawing += draw_arrows(root, arrows, _run_appearance(k).opacity)
         tracks += create_arrow_tracks(root, arrows, run.t[selected], run.mechanism.size, scales)
-    sizes = [f"{scales[is_torque]:.3g} {'N m' if is_torque else 'N'}" for is_torque in sorted(scales)]
-    if sizes:
-        drawing.append(commands.set_status(f"long arrows: {', '.join(sizes)}"))
+    if scales:
+        drawing.append(commands.set_status(f"long arrows: {format_arrow_scales(scales)}"))
 
 
 @dataclass(frozen=True)
@@ -175,17 +180,9 @@ def _create_gap_tracks(
     mechanism: Mechanism, root: str, t: Array, q_tree: Array, poses: Placements, gap: float
 ) -> Iterator[Track]:
     """Yield the keyframes that stretch each loop's rod from frame B over its magnified gap."""
-    frames = {loop.name: mechanism.frames.find(loop.frame_b, loop.name) for loop in mechanism.spec.loop}
-    z = np.array([0.0, 0.0, 1.0])
-    for loop, offsets in compute_loop_gaps(mechanism, q_tree).items():
-        start = poses.point_positions(frames[loop].joint, frames[loop].translation)
-        magnified = gap * offsets
-        path = bodies.gap_path(root, loop)
-        lengths = np.maximum(np.linalg.norm(magnified, axis=1), MIN_GAP_LENGTH)
-        scale = np.column_stack([np.ones((len(t), 2)), lengths])
-        rotations = np.array([pin.Quaternion.FromTwoVectors(z, vector).coeffs() for vector in magnified])
-        yield Track(f"{path}/way", t, {"position": start, "quaternion": rotations, "scale": scale})
-        yield Track(f"{path}/end", t, {"position": start + magnified})
+    offsets = {loop: gap * offsets for loop, offsets in compute_loop_gaps(mechanism, q_tree).items()}
+    for path, values in bodies.stretch_gaps(mechanism, root, poses, offsets).items():
+        yield Track(path, t, values)
 
 
 def _select_keyframes(t: Array, speed: float) -> IntArray:

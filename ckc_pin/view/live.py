@@ -24,7 +24,7 @@ from ckc_pin.scene.scene import Scene
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.commands import Command
 from ckc_pin.view.drawing import WORLD, draw_runs_3d, estimate_reach, set_camera
-from ckc_pin.view.geometry import compute_placements, homogeneous
+from ckc_pin.view.geometry import compute_placements
 from ckc_pin.view.player import open_in_browser, start_server
 
 __all__ = ["LiveView", "live_view"]
@@ -143,13 +143,7 @@ class LiveView:
     def _create_frame(self, t: float, q_tree: Array) -> Command:
         tree = self.mechanism.tree
         pose = compute_placements(self.mechanism, tree.from_coordinates(q_tree)[None])
-        transforms = [
-            commands.set_transform(
-                bodies.body_path(self.mechanism, ROOT, joint),
-                homogeneous(pose.rotation[0, joint], pose.translation[0, joint]),
-            )
-            for joint in range(1, tree.model.njoints)
-        ]
+        transforms = bodies.place_bodies(self.mechanism, ROOT, pose)
         return commands.group_commands([*transforms, commands.set_status(f"t = {t:.2f} of {self.t_end:g} s")])
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.kinematics.mapped import LABELS, Axis, Kind, Locus, SingularityMap
+from ckc_pin.kinematics.mapped import LABELS, Aspect, Axis, Kind, Locus, SingularityMap
 from ckc_pin.view import style
 from ckc_pin.view.layout import add_header, fit_legend, set_panel_title, write_figure
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, figure_style
@@ -17,7 +18,7 @@ from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, f
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_map", "draw_sections", "require_matplotlib", "save_map", "save_sections"]
+__all__ = ["draw_bare_map", "draw_map", "draw_sections", "require_matplotlib", "save_map", "save_sections"]
 
 UNREACHED_COLOUR = "#C9C9C9"
 COLORMAP = "PuOr"  # diverging, singular in the middle; people with colour blindness can tell its sides apart
@@ -31,6 +32,8 @@ DESIRED_STYLE: dict[str, Any] = {"color": style.COLOURS[0], "linewidth": 1.4}
 COLOUR_RANGE_RATIO = 1.5  # range of the colours to that of the values: pale colours let lines stand out
 POINT_TOLERANCE = 1e-9  # in units of the axes: a smaller locus is drawn as a dot
 SECTION_COLUMNS = 3
+BARE_DPI = 100
+UNREACHED_HATCH = "////"  # tells cells that are not reached apart without colour
 
 
 def require_matplotlib() -> None:
@@ -119,6 +122,44 @@ def draw_sections(sections: Sequence[SingularityMap]) -> Figure:
         return figure
 
 
+def draw_bare_map(singularity_map: SingularityMap, aspect: int, width_px: int, height_px: int) -> bytes:
+    """Return one aspect of a map over one or two independent coordinates as a PNG without axes.
+
+    The axes' ranges reach from edge to edge. Colours are dark far from singular configurations and pale near them;
+    cells that are not reached are hatched. No style of matplotlib is set, so that it can be called in any thread.
+
+    Raises
+    ------
+    InputError
+        matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_px / BARE_DPI, height_px / BARE_DPI), dpi=BARE_DPI)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    ax.patch.set(hatch=UNREACHED_HATCH, edgecolor=style.GREY)
+    max_det = max(float(np.nanmax(np.abs(aspect.det_phi_z))) for aspect in singularity_map.aspects)
+    if len(singularity_map.axes) == 2:
+        _draw_aspect(ax, singularity_map, aspect, max_det)
+    else:
+        axis = singularity_map.axes[0]
+        _draw_cells(ax, [axis, Axis("", "", 0.0, 1.0, False, np.zeros(1))], singularity_map.aspects[aspect], max_det)
+        for locus in singularity_map.loci:
+            if locus.on[aspect].any():
+                ax.axvline(_place_on_axis(axis, locus.at[0, 0]), **LOCUS_STYLES[locus.kind])
+        ax.set(xlim=(axis.low, axis.high))
+    ax.set(aspect="auto")
+    ax.set_axis_off()
+    ax.add_artist(ax.patch)  # axes that are off draw no background
+    ax.patch.set_zorder(-1)
+    buffer = BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
 # --- two axes ------------------------------------------------------------------------------------
 
 
@@ -149,11 +190,7 @@ def _draw_aspect(ax: Any, singularity_map: SingularityMap, k: int, max_det: floa
     ax.set_facecolor(UNREACHED_COLOUR)
     ax.grid(False)
     first, second = singularity_map.axes
-    edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in singularity_map.axes]
-    limit = COLOUR_RANGE_RATIO * max_det
-    colours = {"cmap": COLORMAP, "vmin": -limit, "vmax": limit}
-    values = singularity_map.aspects[k].det_phi_z.T
-    mesh = ax.pcolormesh(*edges, values, **colours, shading="flat", rasterized=True)
+    mesh = _draw_cells(ax, singularity_map.axes, singularity_map.aspects[k], max_det)
     for locus in singularity_map.loci:
         _draw_locus(ax, singularity_map.axes, locus, k)
     if singularity_map.path is not None:
@@ -165,6 +202,14 @@ def _draw_aspect(ax: Any, singularity_map: SingularityMap, k: int, max_det: floa
         if axis.turns:
             set_ticks(np.pi * np.arange(-1, 1.1, 0.5), ["$-π$", "$-π/2$", "0", "$π/2$", "$π$"])
     return mesh
+
+
+def _draw_cells(ax: Any, axes: Sequence[Axis], aspect: Aspect, max_det: float) -> Any:
+    """Draw the cells that an aspect reaches. Colours are dark where |det phi_z| is large."""
+    edges = [np.linspace(axis.low, axis.high, len(axis.values) + 1) for axis in axes]
+    limit = COLOUR_RANGE_RATIO * max_det
+    colours = {"cmap": COLORMAP, "vmin": -limit, "vmax": limit}
+    return ax.pcolormesh(*edges, aspect.det_phi_z.T, **colours, shading="flat", rasterized=True)
 
 
 def _panel_aspect(singularity_map: SingularityMap) -> float:
@@ -235,9 +280,7 @@ def _draw_1d(singularity_map: SingularityMap) -> Figure:
         _shade_unreached(ax, axis, singularity_map.counts[:, 0] == 0)
         for locus in singularity_map.loci:
             if locus.on.any():
-                x = locus.at[0, 0]
-                x = np.remainder(x - axis.low, 2 * np.pi) + axis.low if axis.turns else x
-                ax.axvline(x, zorder=3, **LOCUS_STYLES[locus.kind])
+                ax.axvline(_place_on_axis(axis, locus.at[0, 0]), zorder=3, **LOCUS_STYLES[locus.kind])
         ax.axhline(0.0, color=style.GREY, linewidth=0.8)
         if singularity_map.path is not None:
             zeros = np.full(len(singularity_map.path.at), 0.0)
@@ -247,6 +290,11 @@ def _draw_1d(singularity_map: SingularityMap) -> Figure:
                xlim=(axis.low, axis.high))  # fmt: skip
     fit_legend(figure, _create_handles(singularity_map))
     return figure
+
+
+def _place_on_axis(axis: Axis, value: float) -> float:
+    """Return a coordinate within the range of its axis, if that is a full turn."""
+    return float(np.remainder(value - axis.low, 2 * np.pi) + axis.low) if axis.turns else value
 
 
 def _draw_point_curves(ax: Any, singularity_map: SingularityMap) -> None:

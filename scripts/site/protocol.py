@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import msgspec
 
 from ckc_pin.base.key_reference import Key, KeyTable, list_tables
-from ckc_pin.explore.messages import Report, Request
+from ckc_pin.explorer.messages import Report, Request
 
 __all__ = ["DIRECTIONS", "markdown", "message_tables"]
 

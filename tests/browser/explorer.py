@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.explore import messages
-from ckc_pin.explore.server import ExploreServer
+from ckc_pin.explorer import messages
+from ckc_pin.explorer.server import ExploreServer
 from ckc_pin.view import bodies, commands
 from ckc_pin.view.drawing import WORLD, estimate_reach, set_camera
 from ckc_pin.view.geometry import compute_placements, homogeneous

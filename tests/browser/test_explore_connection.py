@@ -8,7 +8,7 @@ from threading import Thread
 
 import numpy as np
 
-from ckc_pin.explore import messages
+from ckc_pin.explorer import messages
 from tests.browser.explorer import ROOT, five_bar, open_explorer, program
 from tests.browser.pages import browser, look_at
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ckc_pin.explore import messages
+from ckc_pin.explorer import messages
 from ckc_pin.view import commands
 from tests.browser.explorer import ROOT, StandIn, five_bar, open_explorer, program
 from tests.browser.pages import Visit, browser, look_at

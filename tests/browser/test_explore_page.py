@@ -10,7 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from ckc_pin.explore import messages
+from ckc_pin.explorer import messages
 from tests.browser.explorer import PARAMETERS, QUANTITIES, ROOT, five_bar, open_explorer, program
 from tests.browser.pages import Visit, browser, look_at
 
@@ -185,7 +185,7 @@ def test_click_in_the_map_goes_there(look_at, five_bar):
     assert five_bar.take(1) == [messages.ShowMap(on=True)]
     five_bar.values |= {"theta_1": -1.0 + 2 * np.pi, "theta_3": 1.0}  # a whole turn is the same place
     five_bar.move()
-    five_bar.report(messages.MapImage(x="theta_1", y="theta_3", x_range=[-2.0, 2.0], y_range=[-1.0, 3.0],
+    five_bar.report(messages.MapImage(x="theta_1", y="theta_3", x_range=[-2.0, 2.0], y_range=[-1.0, 3.0], x_turns=True,
                                       image=paint_map(64, 64), note="green is up"))  # fmt: skip
     visit.until("document.getElementById('map').style.height")
     canvas = visit.page.locator("#map")

@@ -16,8 +16,8 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from ckc_pin.errors import InputError
-from ckc_pin.explore import messages
-from ckc_pin.explore.server import ExploreServer
+from ckc_pin.explorer import messages
+from ckc_pin.explorer.server import ExploreServer
 from ckc_pin.view import commands
 from ckc_pin.view.server import MAX_MESSAGE_BYTES
 from tests.contract.helpers.playback import leave, messages_to

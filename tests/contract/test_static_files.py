@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from playwright._impl._driver import compute_driver_executable
 
-from ckc_pin.explore.page import STATIC as EXPLORE
-from ckc_pin.explore.page import read_explore_script, render_explore_page
+from ckc_pin.explorer.page import STATIC as EXPLORE
+from ckc_pin.explorer.page import read_explore_script, render_explore_page
 from ckc_pin.view.page import STATIC as VIEW
 from ckc_pin.view.page import read_live_script
 

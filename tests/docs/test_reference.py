@@ -13,7 +13,7 @@ import ckc_pin
 from ckc_pin import errors
 from ckc_pin.base.key_reference import KeyTable, describe_structure
 from ckc_pin.cli.key_tables import FILES, tables
-from ckc_pin.explore import messages
+from ckc_pin.explorer import messages
 from ckc_pin.mechanism.spec import LoopType
 from ckc_pin.run.run_file import ARRAYS, OPTIONAL, OTHERS
 from scripts.site import api, commands, keys, protocol, reference_text

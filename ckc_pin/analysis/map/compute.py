@@ -27,7 +27,7 @@ from ckc_pin.analysis.map.grid import (
 from ckc_pin.analysis.map.loci import find_loci
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import require_callable, require_type
+from ckc_pin.base.validation import require_callable, require_flag, require_type
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.extended import ExtendedClosure, Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
@@ -59,6 +59,7 @@ def singularity_map(
     over: Sequence[str] | None = None,
     point: str | None = None,
     cells: int = 200,
+    loci: bool = True,
     progress: Progress | None = None,
 ) -> SingularityMap:
     """Map where a mechanism can go, and where it is singular.
@@ -77,6 +78,8 @@ def singularity_map(
         The point whose serial singularities are searched for. Default: the first one; none without any [[point]].
     cells : int
         Along each axis; rounded up to a multiple of 8.
+    loci : bool
+        Search for singular configurations. Without them, the map is computed several times as fast.
     progress : callable, optional
         Called as progress(fraction), from 0 to 1.
 
@@ -92,6 +95,7 @@ def singularity_map(
     require_type(cells, (int, np.integer), "singularity_map: cells", "a number of cells along an axis")
     if isinstance(over, str):
         raise InputError(f"singularity_map: over: expected one or two names, as [{over!r}], got {over!r}")
+    require_flag(loci, "singularity_map: loci")
     require_callable(progress, "singularity_map: progress", "a function of the completed fraction", 1)
     if mechanism.d == 0:
         raise InputError(f"{mechanism.name}: d = 0, so there is nothing to map; leave out a loop")
@@ -124,13 +128,14 @@ def singularity_map(
         if not grids:
             raise InputError(f"{mechanism.name}: no cell of the map is reached from the assembled configuration")
         seconds = perf_counter() - start
-        loci = [add_positions(extended, locus) for locus in find_loci(extended, domain, grids, over_place, steps)]
-        path = None if desired is None else add_path(desired, mechanism, grids, loci, over_place)
+        searched = find_loci(extended, domain, grids, over_place, steps) if loci else []
+        curves = [add_positions(extended, locus) for locus in searched]
+        path = None if desired is None else add_path(desired, mechanism, grids, curves, over_place)
         return make_map(
             extended,
             "cartesian" if is_cartesian else "joint",
             grids,
-            loci,
+            curves,
             path=path,
             more_branches=has_more,
             seconds=seconds,

@@ -77,7 +77,7 @@ struct PartitionLists {
   Indices at;
   nb::object q, z;
   void update(const Core& core) {
-    if (core.q != at) at = core.q, q = nb::cast(core.q), z = nb::cast(core.z);
+    if (core.q != at || !q.is_valid()) at = core.q, q = nb::cast(core.q), z = nb::cast(core.z);
   }
 };
 

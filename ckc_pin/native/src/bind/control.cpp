@@ -267,7 +267,11 @@ std::unique_ptr<BodyForces> forces_from_tables(const std::vector<nb::dict>& tabl
     std::unique_ptr<WrenchLaw> wrench;
     if (table.contains("function"))
       wrench = std::make_unique<CallbackWrench>(nb::object(table["function"]), view);
-    else
+    else if (table.contains("constant")) {
+      const auto constant = get<Vector>(table, "constant");
+      require(constant, 6, "constant wrench");
+      wrench = std::make_unique<ConstantWrench>(constant);
+    } else
       wrench = std::make_unique<WrenchOverTime>(trajectory_from_table(get<nb::dict>(table, "values"), 6));
     const auto origin = get<Vector>(table, "origin");
     const auto axes = get<Matrix>(table, "axes");

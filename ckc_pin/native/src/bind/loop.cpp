@@ -178,6 +178,34 @@ bool set_control(Loop& loop, nb::handle u, bool torques) {
   return true;
 }
 
+void set_wrench(Loop& loop, size_t force, VectorArg wrench) {
+  const BodyForces* forces = loop.step_loop->system->forces();
+  require(forces && static_cast<Eigen::Index>(6 * force) < forces->wrenches.size(), "force: no such force");
+  require(wrench, 6, "wrench");
+  require(loop.step_loop->set_wrench(force, wrench), "force: it is not constant");
+}
+
+bool move_desired(Loop& loop, double end, VectorArg x) {
+  require(x, loop.core->d, "x"), require(end > loop.step_loop->t(), "end: a later time is needed");
+  return loop.step_loop->move_desired(end, x);
+}
+
+// Return the motor torques at the present state, projected; None if there are none.
+nb::object torques(Loop& loop) {
+  StepLoop& step_loop = *loop.step_loop;
+  System& system = *step_loop.system;
+  Control& control = *step_loop.control;
+  bool exist = step_loop.sync_core();
+  if (exist) loop.core->set_velocity(system.v_tree);
+  exist = exist && system.compute_control(step_loop.t());
+  Vector tau = control.tau;
+  exist = exist && (system.prescribed_joints().empty() || system.set_prescribed_torques(step_loop.t(), tau));
+  if (exist) return nb::cast(tau);
+  control.failure = {}, system.failure = RhsFailure::none;
+  if (loop.view->raised) std::rethrow_exception(std::exchange(loop.view->raised, nullptr));
+  return nb::none();
+}
+
 // Return the present state, projected; None if that fails.
 nb::object state(Loop& loop) {
   StepLoop& step_loop = *loop.step_loop;
@@ -193,10 +221,10 @@ nb::object state(Loop& loop) {
   return nb::make_tuple(step_loop.t(), numbers, loop.partition_lists.q, loop.partition_lists.z);
 }
 
-// Hold u or torques and advance. Return the stop and the state, which is None at a pause; None if a number is not
-// finite.
+// Hold u or torques, unless u is None, and advance. Return the stop and the state, which is None at a pause; None if a
+// number is not finite.
 nb::object step(Loop& loop, nb::handle u, double until, double pause, bool torques) {
-  if (!set_control(loop, u, torques)) return nb::none();
+  if (!u.is_none() && !set_control(loop, u, torques)) return nb::none();
   const Stop stop = advance(loop, until, false, pause, std::numeric_limits<double>::infinity());
   // At a pause, projecting the state would change the initial guesses of the following steps.
   return nb::make_tuple(stop, stop.reason == Stop::pause ? nb::none() : state(loop));
@@ -320,11 +348,16 @@ void bind_loop(nb::module_& m) {
       .def("start", &start, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a, "Start at a state with phi = w.")
       .def("advance", &advance, "until"_a, nb::kw_only(), "final"_a, "pause"_a, "budget"_a,
            "Advance to a time. `final`: the motion ends there; `pause`, `budget`: seconds until the loop returns.")
-      .def("step", &step, "u"_a, "until"_a, "pause"_a, nb::kw_only(), "torques"_a,
-           nb::sig("def step(self, u: numpy.typing.NDArray[numpy.float64], until: float, pause: float, *, "
+      .def("set_wrench", &set_wrench, "force"_a, "wrench"_a, "Apply another constant wrench from now on.")
+      .def("move_desired", &move_desired, "end"_a, "x"_a,
+           "Move the controller's desired q to x until `end`. False if it has none that can be replaced.")
+      .def("torques", &torques, nb::sig("def torques(self) -> numpy.typing.NDArray[numpy.float64] | None"),
+           "Return the motor torques at the present state; None if there are none.")
+      .def("step", &step, "u"_a.none(), "until"_a, "pause"_a, nb::kw_only(), "torques"_a,
+           nb::sig("def step(self, u: numpy.typing.NDArray[numpy.float64] | None, until: float, pause: float, *, "
                    "torques: bool) -> tuple[Stop, tuple[float, numpy.typing.NDArray[numpy.float64], list[int], "
                    "list[int]] | None] | None"),
-           "Hold u, or motor torques, and advance. Return the stop and `state` (None at a pause); None if a number is "
+           "Hold u, or motor torques, and advance; with None the controller acts. Return the stop and `state` (None at a pause); None if a number is "
            "not finite.")
       .def("state", &state,
            nb::sig("def state(self) -> tuple[float, numpy.typing.NDArray[numpy.float64], list[int], list[int]] | None"),

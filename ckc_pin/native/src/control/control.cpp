@@ -46,9 +46,22 @@ TrackingController::TrackingController(Matrix Lambda, Matrix K_D, std::unique_pt
   if (model_) v_model_.setZero(model_->n);
 }
 
+bool TrackingController::move_desired(double begin, double end, In x) {
+  Vector from(x.size()), rate(x.size()), acceleration(x.size());
+  if (!desired()(begin, from, rate, acceleration)) return false;
+  Matrix slopes = Matrix::Zero(2, x.size()), values(2, x.size());
+  slopes.row(0) = (x - from).transpose() / (end - begin);
+  values.row(0) = from.transpose(), values.row(1) = x.transpose();
+  Vector breaks(3);
+  breaks << begin, end, end + 1.0;
+  commanded_ = std::make_unique<SplineTrajectory>(breaks, std::vector<Matrix>{slopes, values});
+  commanded_->set_segment(begin, end, 0.0);
+  return true;
+}
+
 // Evaluate e, e_dot, v, a and r at the measured state.
 bool TrackingController::errors(const MeasuredState& at) {
-  if (!(*desired_)(at.t, e_, v_, a_)) return false;
+  if (!desired()(at.t, e_, v_, a_)) return false;
   e_ = at.q - e_;
   e_dot_ = at.q_dot - v_;
   v_.noalias() -= Lambda_ * e_;
@@ -59,7 +72,7 @@ bool TrackingController::errors(const MeasuredState& at) {
 
 bool TrackingController::compute_u(const MeasuredState& at, Out u, ControlFailure& failure) {
   if (!errors(at)) {
-    failure.message = desired_->failure;
+    failure.message = desired().failure;
     return false;
   }
   Core& core = model_ ? *model_ : at.core;
@@ -141,6 +154,16 @@ double Sampling::next_sample_time() const {
   return static_cast<double>(next_sample) * period;
 }
 
+void Sampling::start(double t) {
+  queue_size = 0;
+  const double until = t + time_tolerance(t);
+  if (times.size())
+    next_sample = std::upper_bound(times.data(), times.data() + times.size(), until) - times.data() - 1;
+  else
+    next_sample = static_cast<long>(std::floor(until / period));
+  next_sample = std::max(next_sample, 0L);
+}
+
 double Sampling::next_instant() const {
   const double sample = next_sample_time();
   return queue_size ? std::min(sample, queue[queue_begin].first) : sample;
@@ -162,10 +185,10 @@ Control::Control(const Core& core, Actuation actuation) : actuation_(std::move(a
   to_fixed_q_.setZero(core.d, core.d);
 }
 
-void Control::start() {
-  if (law) law->state = law->initial_state();
+void Control::start(double t) {
+  if (law) law->reset(), law->state = law->initial_state();
   if (!sampling) return;
-  sampling->next_sample = 0, sampling->queue_size = 0;
+  sampling->start(t);
   constant_is_torque = drive || (law && law->outputs_torques());
   constant.setZero(constant_is_torque ? tau.size() : u.size());
   sample_ = constant;

@@ -29,6 +29,10 @@ class Controller {
   virtual bool state_rate(const MeasuredState&, Out /*rate*/, ControlFailure&) { return true; }
   // Times from now on lie in [begin, end], see Trajectory.
   virtual void set_segment(double /*begin*/, double /*end*/, double /*tolerance*/) {}
+  // Move the desired q from its present value at `begin` to x at `end`, at a constant rate, and hold it there, until the
+  // next reset. False if the law has no desired q that can be replaced, or none at `begin`.
+  virtual bool move_desired(double /*begin*/, double /*end*/, In /*x*/) { return false; }
+  virtual void reset() {}
   // Value of the Lyapunov function, NaN if there is none. `w`: present value of phi.
   virtual double lyapunov(const MeasuredState&, double, In) { return std::numeric_limits<double>::quiet_NaN(); }
   // Whether it uses terms in the fixed partition, not only q and q_dot.
@@ -71,16 +75,19 @@ class TrackingController : public Controller {
   void set_segment(double begin, double end, double tolerance) override {
     desired_->set_segment(begin, end, tolerance);
   }
+  bool move_desired(double begin, double end, In x) override;
+  void reset() override { commanded_.reset(); }
   double lyapunov(const MeasuredState& at, double potential_energy, In w) override;
   bool derivatives(Core& plant, const Indices& fixed_q, Matrix& by_q, Matrix& by_v) override;
   void gain_derivative(const MeasuredState& at, const Matrix& Lambda, const Matrix& K_D, Out derivative) override;
 
  private:
   Matrix Lambda_, K_D_;
-  std::unique_ptr<Trajectory> desired_;
+  std::unique_ptr<Trajectory> desired_, commanded_;  // `commanded_` replaces `desired_`, unless it is null
   std::unique_ptr<Core> model_;
   bool actual_;
   bool errors(const MeasuredState& at);
+  Trajectory& desired() { return commanded_ ? *commanded_ : *desired_; }
   Vector e_, e_dot_, v_, a_, r_;  // errors and reference motion at the last measured state, for `derivatives`
   Vector product_, Lambda_e_, v_model_;
 };
@@ -139,6 +146,7 @@ struct Sampling {
 
   double time_tolerance(double t) const { return 1e-9 * period + 1e-15 * t; }  // instants closer than this coincide
   double next_sample_time() const;
+  void start(double t);  // the last sample instant up to t comes next
   double next_instant() const;  // of a sample or of a delayed output
   void queue_output(double t, In u);
 };
@@ -156,7 +164,7 @@ class Control {
   ControlFailure failure;
   Vector u, tau, u_tree;  // present values: (d), (motors), (n)
 
-  void start();  // reset at the start of a run
+  void start(double t);  // reset at the start of a run
   bool is_active() const { return law || !constant.isZero(0); }
   // Replace the constant u or torques. False if they are unchanged.
   bool set_constant(In value, bool outputs_torques);

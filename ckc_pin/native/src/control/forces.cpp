@@ -10,6 +10,10 @@ void BodyForces::set_segment(double begin, double end, double tolerance) {
   for (const BodyForce& force : forces_) force.wrench->set_segment(begin, end, tolerance);
 }
 
+void BodyForces::reset() {
+  for (const BodyForce& force : forces_) force.wrench->reset();
+}
+
 Vector6 BodyForces::in_world_axes(const Tree& tree, size_t k, Vector3& origin) const {
   const BodyForce& force = forces_[k];
   const Matrix3 rotation = tree.rotation(force.joint);
@@ -31,6 +35,7 @@ bool BodyForces::compute(const MeasuredState& at, ControlFailure& failure) {
   value.setZero();
   Vector3 origin;
   for (size_t k = 0; k < forces_.size(); ++k) {
+    if (wrenches.segment<6>(6 * static_cast<Eigen::Index>(k)).isZero(0)) continue;
     const Vector6 wrench = in_world_axes(tree, k, origin);
     for (int j : tree.support[forces_[k].joint]) value(j) += wrench.dot(columns.col(j));
   }

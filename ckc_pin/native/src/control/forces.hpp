@@ -16,6 +16,21 @@ class WrenchLaw {
   virtual bool evaluate(const MeasuredState& at, Out wrench, ControlFailure& failure) = 0;
   virtual void set_segment(double /*begin*/, double /*end*/, double /*tolerance*/) {}
   virtual bool depends_on_state() const { return false; }
+  // Replace a constant wrench, until the next reset. False if the wrench is no constant.
+  virtual bool set(In /*wrench*/) { return false; }
+  virtual void reset() {}
+};
+
+class ConstantWrench : public WrenchLaw {
+ public:
+  explicit ConstantWrench(Vector value) : initial_(std::move(value)), value_(initial_) {}
+  bool evaluate(const MeasuredState&, Out wrench, ControlFailure&) override { return wrench = value_, true; }
+  bool set(In wrench) override { return value_ = wrench, true; }
+  void reset() override { value_ = initial_; }
+
+ private:
+  const Vector initial_;
+  Vector value_;
 };
 
 // A wrench that is a function of time.
@@ -50,6 +65,9 @@ class BodyForces {
   // Compute `value` at the core's state. False if a wrench does not exist.
   bool compute(const MeasuredState& at, ControlFailure& failure);
   void set_segment(double begin, double end, double tolerance);
+  // Replace the wrench of a force, until the next reset. False if it is no constant.
+  bool set(size_t k, In wrench) { return forces_[k].wrench->set(wrench); }
+  void reset();
   // Add the derivative of `value` with respect to q' (tangent), (n, n). False if a wrench depends on the state,
   // because its derivative is unknown.
   bool add_derivative(Core& core, Matrix& by_q) const;

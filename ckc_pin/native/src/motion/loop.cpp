@@ -52,7 +52,8 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   work = {}, work.max_rhs = options_.max_rhs;
   system->counts = {}, system->failure = RhsFailure::none;
   control->failure = {};
-  control->start();
+  control->start(t);
+  if (system->forces()) system->forces()->reset();
   system->start_prescribed_joints(q_tree, v_tree);
   system->start_segment(t);
   reset_joints();
@@ -84,6 +85,16 @@ void StepLoop::state_changed() {
 
 void StepLoop::set_control(In u, bool of_motors) {
   if (control->set_constant(u, of_motors)) state_changed();
+}
+
+bool StepLoop::set_wrench(size_t force, In wrench) {
+  if (!system->forces()->set(force, wrench)) return false;
+  return state_changed(), true;
+}
+
+bool StepLoop::move_desired(double end, In x) {
+  if (!control->law || !control->law->move_desired(t(), end, x)) return false;
+  return state_changed(), true;
 }
 
 Stop StepLoop::advance(double until, bool final, double pause, double budget) {

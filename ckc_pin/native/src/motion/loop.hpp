@@ -61,6 +61,10 @@ class StepLoop {
   }
   // Apply a constant u, or constant motor torques, from now on.
   void set_control(In u, bool of_motors);
+  // Apply a constant wrench from now on. False if that force is no constant.
+  bool set_wrench(size_t force, In wrench);
+  // Move the controller's desired q to x until `end`, see Controller. False if it has none that can be replaced.
+  bool move_desired(double end, In x);
   // Advance to a time. `final`: the motion ends there. `pause`, `budget`: seconds until the next pause and until the
   // end of the budget. A call with the same `until` after a pause continues as if there had been none.
   //

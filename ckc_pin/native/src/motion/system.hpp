@@ -95,7 +95,7 @@ class System {
   // where a motion begins is caused by an impulse of the joint's motor. False if that fails.
   bool switch_prescribed_joints(double t, Out y, const Indices& events);
   void set_forces(std::unique_ptr<BodyForces> forces) { forces_ = std::move(forces); }
-  const BodyForces* forces() const { return forces_.get(); }
+  BodyForces* forces() const { return forces_.get(); }
   void set_breakpoints(Breakpoints breakpoints) { breakpoints_ = fixed_breakpoints_ = std::move(breakpoints); }
   double next_breakpoint() const;
   double breakpoint_tolerance() const { return breakpoints_.tolerance; }

@@ -1,5 +1,5 @@
 // The explorer's page: connects the panel, the picture and the program. The page shows what the program reports and
-// keeps no state of its own. ckc_pin/explore/messages.py describes the messages.
+// keeps no state of its own. ckc_pin/explorer/messages.py describes the messages.
 var explorer = (function () {
   const RETRY_MS = 1000;
   const NOTICE_MS = 8000;  // how long a notice is shown that is no error

@@ -571,6 +571,10 @@ class MapImage(Report, frozen=True, kw_only=True):
         Values of x at the left and right edges.
     y_range : rad, m
         Values of y at the lower and upper edges.
+    x_turns
+        Whether the horizontal axis is a full turn, so that the place of a point is found modulo 2 pi.
+    y_turns
+        The same of the vertical axis.
     image
         PNG as base64, its rows from the upper end of y downwards. "": no map is shown.
     note
@@ -582,6 +586,8 @@ class MapImage(Report, frozen=True, kw_only=True):
     x_range: list[float] = []
     y_range: list[float] = []
     image: str = ""
+    x_turns: bool = False
+    y_turns: bool = False
     note: str = ""
 
 

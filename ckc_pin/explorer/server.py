@@ -13,8 +13,8 @@ from itertools import count
 import msgspec
 
 from ckc_pin.errors import InputError
-from ckc_pin.explore.messages import FrameShown, Notice, Request, read_request
-from ckc_pin.explore.page import read_explore_script, render_explore_page
+from ckc_pin.explorer.messages import FrameShown, Notice, Request, read_request
+from ckc_pin.explorer.page import read_explore_script, render_explore_page
 from ckc_pin.view.commands import Command
 from ckc_pin.view.server import ViewServer
 
