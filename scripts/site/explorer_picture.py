@@ -16,7 +16,6 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Page, sync_playwright
 
 import ckc_pin
-from scripts.experiments.chart import shrink
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE = (920, 540)  # of the window, pixels
@@ -59,7 +58,10 @@ class Film:
             radius = 7 if self.is_down else 9
             outline = (20, 20, 20)
             ImageDraw.Draw(image).ellipse(
-                (x - radius, y - radius, x + radius, y + radius), fill=outline if self.is_down else None, outline=outline, width=2
+                (x - radius, y - radius, x + radius, y + radius),
+                fill=outline if self.is_down else None,
+                outline=outline,
+                width=2,
             )
             self.frames.append(image.resize((round(SCALE * image.width), round(SCALE * image.height)), Image.LANCZOS))
 
@@ -101,7 +103,9 @@ def main() -> None:
         page.wait_for_function(READY, polling=100) if False else time.sleep(3)
         film = Film(page)
         x, y = page.evaluate(POINT, ["theta_2", [0.2794, 0.0, 0.0]])
-        film.drag([(x + 110 * math.sin(s), y - 70 * (1 - math.cos(2 * s))) for s in [k * math.pi / 20 for k in range(41)]])
+        film.drag(
+            [(x + 110 * math.sin(s), y - 70 * (1 - math.cos(2 * s))) for s in [k * math.pi / 20 for k in range(41)]]
+        )
         film.save(IMAGES / "explore.gif")
         browser.close()
     print(f"written: {IMAGES / 'explore.gif'}")

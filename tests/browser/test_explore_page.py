@@ -528,7 +528,7 @@ def test_narrow_page_has_no_overflow_and_every_control_is_reachable(look_at, fiv
         box = control.bounding_box()
         assert box["x"] >= 0, control
         assert box["x"] + box["width"] <= 400, control
-        assert 0 <= box["y"] <= 800 - box["height"], control
+        assert -1 < box["y"] < 801 - box["height"], control  # scrolling rounds to pixels
     assert visit.page.locator("#meshcat-pane").bounding_box()["height"] > 300
     visit.page.click("#collapse")
     assert visit.page.locator("#collapse").get_attribute("aria-expanded") == "false"
