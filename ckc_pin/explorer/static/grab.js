@@ -199,7 +199,7 @@ var grab = (function () {
     const object = drag && findObject(bodies[drag.body]);
     if (!object) { return; }
     viewer.scene.updateMatrixWorld(true);
-    const position = line.geometry.attributes.position;
+    const position = line.geometry.attributes.position;  // in the scene's axes; the scene itself is turned
     [object.localToWorld(drag.point.clone()), drag.target.clone()].forEach(function (end, k) {
       position.setXYZ(k, ...line.worldToLocal(end).toArray());
     });

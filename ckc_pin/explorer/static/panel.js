@@ -365,13 +365,13 @@ class MapCanvas {
   }
 
   drawPoint(context, frame) {
-    const fraction = (name, [low, high]) => {
+    const fraction = (name, [low, high], turns) => {
       let value = this.values[name];
-      if (this.units[name] === "rad") { value -= 2 * Math.PI * Math.floor((value - low) / (2 * Math.PI)); }
+      if (turns) { value -= 2 * Math.PI * Math.floor((value - low) / (2 * Math.PI)); }
       return (value - low) / (high - low);
     };
-    const u = fraction(this.map.x, this.map.x_range);
-    const v = this.map.y ? fraction(this.map.y, this.map.y_range) : 0.5;
+    const u = fraction(this.map.x, this.map.x_range, this.map.x_turns);
+    const v = this.map.y ? fraction(this.map.y, this.map.y_range, this.map.y_turns) : 0.5;
     if (!(u >= 0 && u <= 1 && v >= 0 && v <= 1)) { return; }
     const x = frame.left + u * frame.width, y = frame.top + (1 - v) * frame.height;
     const arm = 8;
