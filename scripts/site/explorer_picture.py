@@ -1,7 +1,7 @@
 """The moving picture of the explorer: python -m scripts.site.explorer_picture writes docs/images/explore.gif.
 
-A Chromium without a window shows the page while the mouse of Playwright drags the five-bar, switches its branch and lets
-it go. The two static pictures of the manual are of the same page, at two widths.
+A Chromium without a window shows the page while the mouse of Playwright drags the five-bar, switches its branch, lets
+it go and pushes it.
 """
 
 from __future__ import annotations
@@ -9,22 +9,21 @@ from __future__ import annotations
 import io
 import math
 import shutil
-import time
 from pathlib import Path
 
 from PIL import Image, ImageDraw
 from playwright.sync_api import Page, sync_playwright
 
 import ckc_pin
-from scripts.experiments.chart import shrink
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE = (920, 540)  # of the window, pixels
 SCALE = 0.75  # of the picture
 FRAME_MS = 80
-COLOURS = 48
+COLOURS = 80
+STARTING_MS = 3000
+TIP = ["theta_2", [0.2794, 0.0, 0.0]]  # body and place of the dragged point
 ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]  # WebGL without a GPU
-READY = "() => document.getElementById('closure').textContent && !viewer.needs_render"
 
 # Where a named point is in the window.
 POINT = """(name) => {
@@ -59,9 +58,14 @@ class Film:
             radius = 7 if self.is_down else 9
             outline = (20, 20, 20)
             ImageDraw.Draw(image).ellipse(
-                (x - radius, y - radius, x + radius, y + radius), fill=outline if self.is_down else None, outline=outline, width=2
+                (x - radius, y - radius, x + radius, y + radius),
+                fill=outline if self.is_down else None,
+                outline=outline,
+                width=2,
             )
-            self.frames.append(image.resize((round(SCALE * image.width), round(SCALE * image.height)), Image.LANCZOS))
+            self.frames.append(
+                image.resize((round(SCALE * image.width), round(SCALE * image.height)), Image.Resampling.LANCZOS)
+            )
 
     def drag(self, path: list[tuple[float, float]], hold: int = 0) -> None:
         """Drag along a path."""
@@ -86,23 +90,51 @@ class Film:
         self.shoot(count)
 
     def save(self, path: Path) -> None:
-        """Write the frames as a GIF."""
-        palette = self.frames[len(self.frames) // 2].quantize(COLOURS, dither=Image.Dither.NONE)
+        """Write the frames as a GIF with one palette, in which the colours of all links are kept."""
+        shown = self.frames[:: max(1, len(self.frames) // 6)]
+        montage = Image.new("RGB", (shown[0].width, len(shown) * shown[0].height))
+        for k, frame in enumerate(shown):
+            montage.paste(frame, (0, k * frame.height))
+        palette = montage.quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         frames = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames]
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0, optimize=True)
 
 
+def wave(x: float, y: float, width: float, height: float, count: int) -> list[tuple[float, float]]:
+    """Return a path of the mouse: to one side, to the other, and back, up at both sides."""
+    angles = [2 * math.pi * k / count for k in range(count + 1)]
+    return [(x + width * math.sin(s), y - height * (1 - math.cos(2 * s))) for s in angles]
+
+
+def film_five_bar(page: Page) -> Film:
+    """Drag the tip with traces, switch the branch, let go, and push while it swings."""
+    film = Film(page)
+    x, y = page.evaluate(POINT, TIP)
+    film.drag(wave(x, y, 110, 45, 36))
+    for section in ("#move-section", "#show-section"):
+        page.locator(f"{section} > summary").click()
+    film.click("#branches-section > summary", 1)
+    film.click("#branches-button", 6)
+    film.click("#branches button >> nth=1", 6)
+    film.click("#undo", 3)
+    page.locator("#branches-section > summary").click()
+    film.click("#run-section > summary", 1)
+    film.click("#start", 6)
+    x, y = page.evaluate(POINT, TIP)
+    film.drag([(x + 3 * k, y - 2 * k) for k in range(20)], 6)
+    film.shoot(10)
+    return film
+
+
 def main() -> None:
-    """Write the pictures."""
+    """Write the moving picture."""
     with ckc_pin.explore("five_bar") as explorer, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.goto(explorer.url)
-        page.wait_for_function(READY, polling=100) if False else time.sleep(3)
-        film = Film(page)
-        x, y = page.evaluate(POINT, ["theta_2", [0.2794, 0.0, 0.0]])
-        film.drag([(x + 110 * math.sin(s), y - 70 * (1 - math.cos(2 * s))) for s in [k * math.pi / 20 for k in range(41)]])
-        film.save(IMAGES / "explore.gif")
+        page.wait_for_timeout(STARTING_MS)
+        page.evaluate("viewer.hide_background()")  # Its gradient would take most colours of the palette.
+        film_five_bar(page).save(IMAGES / "explore.gif")
         browser.close()
     print(f"written: {IMAGES / 'explore.gif'}")
 
