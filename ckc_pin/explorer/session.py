@@ -51,7 +51,7 @@ from ckc_pin.explorer.messages import (
 )
 from ckc_pin.explorer.opening import Opened, close_again
 from ckc_pin.explorer.parameters import list_parameters, rebuild
-from ckc_pin.explorer.paths import BRANCHES, EXPLORED
+from ckc_pin.explorer.paths import BRANCHES, EXPLORED, SHOWN
 from ckc_pin.explorer.quantities import Quantities
 from ckc_pin.kinematics.moving import Movement, drag_point, move_coordinate, move_independent
 from ckc_pin.mechanism.configuration import Kinematics
@@ -167,7 +167,13 @@ class Session:
             can_undo=self.history.can_undo and self._run is None,
             can_redo=self.history.can_redo and self._run is None,
         )
-        frame += [*shown.commands, report.to_command()]
+        for command in shown.commands:
+            # Frames may be skipped, and only the last one is kept for pages that connect later.
+            if command["type"] == "set_transform":
+                frame.append(command)
+            else:
+                self._send(command)
+        frame.append(report.to_command())
         if self._run is not None:
             frame.append(self._run.report().to_command())
         self._send(commands.group_commands(frame))
@@ -353,10 +359,8 @@ class Session:
     def _restore(self, snapshot: Snapshot) -> None:
         self._hide_branches()
         if dict(snapshot.parameters) != self.parameters:
-            mechanism, _ = rebuild(self.original, snapshot.parameters, self.mechanism.kinematics(snapshot.q_tree))
-            self._replace_mechanism(mechanism, dict(snapshot.parameters))
-            self._draw_bodies()
-            self._describe()
+            mechanism, at = rebuild(self.original, snapshot.parameters, self.mechanism.kinematics(snapshot.q_tree))
+            self._replace_mechanism(mechanism, at, dict(snapshot.parameters))
         self.at, self._end, self._ended = self.mechanism.kinematics(snapshot.q_tree), "", ""
 
     def _close_loops(self) -> None:
@@ -374,22 +378,23 @@ class Session:
             raise InputError("parameters can be changed when the loops are closed")
         self._hide_branches()
         mechanism, at = rebuild(self.original, values, self.at)
-        self._replace_mechanism(mechanism, values)
-        self.at = at
+        self._replace_mechanism(mechanism, at, values)
         snapshot = Snapshot(at.q_tree, dict(values))
         if slider and slider == self._last_slider:
             self.history.replace_parameters(snapshot)
         else:
             self.history.add(snapshot)
         self._last_slider = slider
-        self._draw_bodies()
-        self._describe()
 
-    def _replace_mechanism(self, mechanism: Mechanism, parameters: dict[str, float]) -> None:
-        self.mechanism, self.parameters = mechanism, parameters
+    def _replace_mechanism(self, mechanism: Mechanism, at: Kinematics, parameters: dict[str, float]) -> None:
+        """Continue with the mechanism of other parameter values at a pose; draw and describe it."""
+        self.mechanism, self.at, self.parameters = mechanism, at, parameters
         shown = [info.name for info in self.quantities.infos() if info.on]
         self.quantities.close()
+        self._send(commands.delete(SHOWN))
+        self._draw_bodies()  # before the quantities, some of which draw on the bodies
         self.quantities = self._make_quantities(shown)
+        self._describe()
         if self._has_map:
             self.map_panel.request(mechanism, self.at)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -25,6 +26,7 @@ from ckc_pin.explorer.messages import (
     SetMotor,
     SetParameter,
     Show,
+    ShowMap,
     StartRun,
     StopRun,
     Undo,
@@ -32,6 +34,7 @@ from ckc_pin.explorer.messages import (
 from ckc_pin.explorer.opening import open_explored
 from ckc_pin.explorer.session import Session
 from ckc_pin.kinematics.sigma import assembly_branches, sigma
+from ckc_pin.view.commands import SceneState
 from tests.analytic.five_bar import FIVE_BAR
 from tests.analytic.test_point import tip
 from tests.conftest import assert_close
@@ -291,3 +294,31 @@ def test_quantities_are_computed_while_they_are_shown(open_desk):
     assert value == reference == pytest.approx(desk.session.at.margin(), rel=1e-12)
     desk.ask(Show("conditioning", False))
     assert desk.report("pose")["margins"] == {}
+
+
+def test_drawings_of_quantities_survive_another_parameter_value() -> None:
+    desk, objects = Desk("five_bar"), []
+    desk.ask(Show(quantity="centre_of_mass", on=True), Show(quantity="traces", on=True))
+    desk.ask(Move(coordinate="theta_1", value=-1.2))
+    for values in ({}, {"link.link_1.mass": 0.4}):
+        desk.ask(*(SetParameter(name=name, value=value) for name, value in values.items()))
+        scene = SceneState()
+        for command in desk.sent:
+            scene.apply(command)
+        drawn = {message["path"] for message in map(msgspec.msgpack.decode, scene.messages())
+                 if message["type"] == "set_object"}  # fmt: skip
+        objects.append(drawn)
+    before, after = objects
+    assert {path for path in before if "/traces/" in path}  # of the mechanism with the old values
+    assert after == {path for path in before if "/traces/" not in path}
+    assert sum("/loop:elbow:" in path for path in after) == 2
+    assert any("/centre_of_mass/" in path for path in after)
+
+
+def test_map_after_another_parameter_value_begins_at_the_closed_pose(monkeypatch) -> None:
+    desk, requested = Desk("five_bar"), []
+    monkeypatch.setattr(desk.session.map_panel, "request", lambda mechanism, at: requested.append((mechanism, at)))
+    desk.ask(ShowMap(), SetParameter(name="joint.theta_2.xyz.x", value=0.26))
+    assert len(requested) == 2
+    for mechanism, at in requested:
+        assert np.abs(mechanism.kinematics(at.q_tree).phi).max() <= 1e-10
