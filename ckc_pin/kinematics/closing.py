@@ -16,7 +16,6 @@ from ckc_pin.mechanism.tree import Tree
 __all__ = ["EXACT_TOLERANCE", "ROUNDED_TOLERANCE", "Assembly", "close_loops", "find_nearby"]
 
 RESTARTS = 20  # from perturbed guesses
-MAX_SPREAD = np.pi  # rad, or mechanism sizes: largest perturbation
 MAX_ITERATIONS = 100  # of the Gauss-Newton method
 STALL_ITERATIONS = 6  # from a perturbed guess: a smaller decrease of |phi| in so many steps counts as a local minimum
 STALL_DECREASE = 0.01  # relative
@@ -106,7 +105,7 @@ def close_loops(
     if closed or not restarts or not may_restart():
         return best
     for attempt in range(restarts):
-        spread = min(0.1 * 1.4**attempt, MAX_SPREAD)
+        spread = 0.1 * 1.4**attempt
         step = free * tree.step_scale * random.uniform(-spread, spread, tree.n)
         trial, closed = outcome(tree.integrate(q_tree, step), max(tolerance, rounded))
         if closed or trial.residual < best.residual:
