@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -63,12 +65,21 @@ def writable_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a cache folder with compiled terms of the mechanisms that behaviour is tested with."""
-    folder = tmp_path_factory.mktemp("compiled")
+    """Return a cache folder with compiled terms of the mechanisms that behaviour is tested with.
+
+    All workers share it. Each of them starts with another mechanism, and waits if another worker is compiling one.
+    """
+    folder, worker = tmp_path_factory.getbasetemp(), os.environ.get("PYTEST_XDIST_WORKER", "")
+    folder = (folder.parent if worker else folder) / "compiled"
+    folder.mkdir(exist_ok=True)
+    names = deque(["five_bar", "four_bar", "n_four_bar", "slider_crank"])
+    names.rotate(2 * int(worker.removeprefix("gw") or 0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        for name in ("five_bar", "four_bar", "n_four_bar", "slider_crank"):
-            compile_terms(load(name))
+        for name in names:
+            with (folder / f"{name}.lock").open("w", encoding="utf-8") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                compile_terms(load(name))
     return folder
 
 

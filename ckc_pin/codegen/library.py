@@ -91,7 +91,7 @@ def compile_terms(
     directional_derivatives: bool = False,
     limited: bool = True,
 ) -> Library:
-    """Return a mechanism's compiled terms, from the cache or compiled now.
+    """Return a mechanism's compiled terms: from the cache, compiled earlier in this process, or compiled now.
 
     Parameters
     ----------
@@ -115,9 +115,10 @@ def compile_terms(
     if limited and (reason := explain_too_large(mechanism)):
         raise InputError(reason)
     subject = _Subject.of(mechanism, which, directional_derivatives)
-    library = _look_up(subject, cache_folder())
-    if library is not None:
-        return library
+    is_used = _process_folder.cache_info().currsize > 0  # by terms that the cache could not take
+    for folder in (cache_folder(), *([_process_folder()] if is_used else [])):
+        if (library := _look_up(subject, folder)) is not None:
+            return library
     compiler = find_compiler(subject.directional_derivatives)
     if compiler is None:
         raise InputError("compiled terms need a C compiler: `cc` was not found on PATH")

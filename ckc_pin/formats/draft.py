@@ -13,7 +13,7 @@ import pinocchio as pin
 from ckc_pin.base.sources import Sources
 from ckc_pin.errors import MechanismError
 from ckc_pin.formats.robot import Tables, WithComment
-from ckc_pin.kinematics.assembly import assemble_mechanism
+from ckc_pin.kinematics.assembly import OpenLoopsError, assemble_mechanism
 from ckc_pin.mechanism.frames import Frames
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.spec import JointSpec, MechanismSpec
@@ -84,14 +84,15 @@ class Draft(Tables):
         return tree, Frames(tree.model), urdf
 
     def build_mechanism(self) -> Mechanism:
-        """Build and assemble the mechanism, as `ckc check` does for the written files.
+        """Build and assemble the mechanism, as `ckc check` does for the written files, which explains open loops.
 
         Raises
         ------
         MechanismError
             The loops cannot be closed, or `independent` does not determine the configuration.
         """
-        return assemble_mechanism(self.to_spec(), Sources(self.name, None, {self.urdf_file: self.urdf_text()}))
+        sources = Sources(self.name, None, {self.urdf_file: self.urdf_text()})
+        return assemble_mechanism(self.to_spec(), sources, explain=False)
 
 
 # --- independent coordinates ---------------------------------------------------------------------------------------
@@ -108,6 +109,8 @@ def choose_independent(draft: Draft) -> None:
         try:
             draft.build_mechanism()
             return
+        except OpenLoopsError:
+            return
         except MechanismError as error:
             draft.independent = None
             mechanism = _try_to_build(draft)
@@ -118,10 +121,12 @@ def choose_independent(draft: Draft) -> None:
             draft.guessed.append(f"independent is chosen by the program; the file's choice does not work: {reason}")
     elif draft.actuated and (draft.loops or draft.couplings):
         draft.independent, draft.why_independent = [*draft.actuated], "the actuated joints"
-        if _try_to_build(draft) is not None:
+        try:
+            draft.build_mechanism()
             return
-        draft.independent, draft.why_independent = None, ""
-        mechanism = _try_to_build(draft)
+        except MechanismError as error:
+            draft.independent, draft.why_independent = None, ""
+            mechanism = None if isinstance(error, OpenLoopsError) else _try_to_build(draft)
         names = [] if mechanism is None else list(mechanism.independent)
         if not set(draft.actuated) <= set(names):
             return

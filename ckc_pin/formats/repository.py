@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from pathlib import Path
 
+from ckc_pin.base.toml import read_text
 from ckc_pin.errors import InputError
 
 __all__ = ["find_folder", "find_in_repository", "repository_of", "resolve_links"]
@@ -30,8 +32,12 @@ def repository_of(folder: Path) -> Path:
 
 
 def find_folder(name: str, root: Path, model: Path) -> Path:
-    """Return the folder of a package inside a repository. It must exist."""
-    choices = [folder for folder in (root, *sorted(root.glob("*")), *sorted(root.glob("*/*"))) if folder.name == name]
+    """Return the folder of a package inside a repository, by the <name> in its package.xml or the folder's own."""
+    folders = [root, *sorted(root.glob("*")), *sorted(root.glob("*/*"))]
+    is_named = re.compile(rf"<name>\s*{re.escape(name)}\s*</name>").search
+    manifests = [folder / "package.xml" for folder in folders]
+    choices = [m.parent for m in manifests if m.is_file() and is_named(read_text(m, "package manifest"))]
+    choices += [folder for folder in folders if folder.name == name]
     if not choices:
         raise InputError(f"{model}: no package {name!r} in the model's repository {root.name!r}")
     return choices[0]

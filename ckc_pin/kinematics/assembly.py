@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from itertools import islice
 
 import msgspec
 import numpy as np
@@ -15,6 +17,7 @@ from ckc_pin.kinematics.closing import EXACT_TOLERANCE, ROUNDED_TOLERANCE, Assem
 from ckc_pin.kinematics.continuation import same_branch
 from ckc_pin.kinematics.loop_types import describe_locking_loops, list_closing_types
 from ckc_pin.kinematics.sigma import follow_sigma, newton, sigma
+from ckc_pin.mechanism.closure import ClosureBuilder
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.couplings import coefficients_of, coupled_joints, curve_of
 from ckc_pin.mechanism.linkage import Linkage
@@ -25,7 +28,11 @@ from ckc_pin.mechanism.rank import count_freedoms
 from ckc_pin.mechanism.spec import CouplingSpec, MechanismSpec
 from ckc_pin.mechanism.warnings import find_model_warnings
 
-__all__ = ["assemble_mechanism", "open_loops", "reassemble"]
+__all__ = ["OpenLoopsError", "assemble_mechanism", "open_loops", "reassemble"]
+
+
+class OpenLoopsError(MechanismError):
+    """The loops cannot be closed from the guess, whichever coordinates are independent."""
 
 
 def assemble_mechanism(
@@ -33,8 +40,11 @@ def assemble_mechanism(
     sources: Sources,
     overrides: Overrides | None = None,
     prescribed: Mapping[str, float | None] | None = None,
+    explain: bool = True,
 ) -> Mechanism:
     """Assemble a mechanism from its files, with overrides of its parameters and positions of prescribed joints by name.
+
+    `explain`: whether the message about open loops gives the reason. Finding it takes longer than an assembly.
 
     Raises
     ------
@@ -46,7 +56,7 @@ def assemble_mechanism(
     with one_blas_thread():
         guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)
         guess = _apply_couplings(linkage, guess)
-        mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess)))
+        mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess), explain))
         if linkage.spec.independent is None:
             mechanism = _restore_guess(linkage, mechanism)
         if prescribed:
@@ -268,13 +278,18 @@ def _excess(linkage: Linkage, numbers: Array) -> Array:
     return np.abs(numbers - np.clip(numbers, linkage.joints.lower, linkage.joints.upper))
 
 
-def _assemble(linkage: Linkage, start: Array) -> Assembly:
-    """Close the loops near a guess, within the stops of the joints if possible."""
+def _assemble(linkage: Linkage, start: Array, explain: bool = True) -> Assembly:
+    """Close the loops near a guess, within the stops of the joints if possible.
+
+    Other guesses are not tried if one of several loops stays open even without the others.
+    """
     scale = linkage.size
-    closed = _close_near(linkage, start)
+    open_alone = cache(lambda: dict(islice(_loops_open_alone(linkage, start), None if explain else 1)))
+    closed = _close_near(linkage, start, may_restart=lambda: len(linkage.spec.loop) == 1 or not open_alone())
     if closed.residual > ROUNDED_TOLERANCE * scale:
+        why = _why_not_closed(linkage, closed, start, open_alone()) if explain else "not closed"
         nearest = linkage.tree.named(linkage.tree.to_coordinates(closed.q_tree))
-        raise MechanismError(f"{linkage.sources.name}: {_why_not_closed(linkage, closed, start)}", q_tree=nearest)
+        raise OpenLoopsError(f"{linkage.sources.name}: {why}", q_tree=nearest)
     reversed_ = linkage.closure.reversed_hinges(Pose(linkage.tree, linkage.closure.anchors, closed.q_tree))
     if reversed_:
         raise MechanismError(
@@ -290,18 +305,39 @@ def _assemble(linkage: Linkage, start: Array) -> Assembly:
     return closed
 
 
-def _close_near(linkage: Linkage, start: Array, bounds: tuple[Array, Array] | None = None) -> Assembly:
+def _close_near(
+    linkage: Linkage,
+    start: Array,
+    bounds: tuple[Array, Array] | None = None,
+    may_restart: Callable[[], bool] = lambda: True,
+) -> Assembly:
     """Close the loops with the independent coordinates fixed at their guess; if that fails, with all coordinates."""
     closed: Assembly | None = None
     tree, exact, rounded = linkage.tree, EXACT_TOLERANCE * linkage.size, ROUNDED_TOLERANCE * linkage.size
+
+    def close(free: Array) -> Assembly:
+        closure = linkage.closure
+        return close_loops(tree, closure, start, free, exact, bounds=bounds, rounded=rounded, may_restart=may_restart)
+
     if linkage.spec.independent is not None:
         free = np.ones(tree.n)
         fixed = [name for name in linkage.spec.independent if name not in linkage.prescribed]
         free[tree.indices(tuple(fixed), "independent")] = 0.0
-        closed = close_loops(tree, linkage.closure, start, free, exact, bounds=bounds, rounded=rounded)
+        closed = close(free)
     if closed is None or closed.residual > rounded:
-        closed = close_loops(tree, linkage.closure, start, np.ones(tree.n), exact, bounds=bounds, rounded=rounded)
+        closed = close(np.ones(tree.n))
     return closed
+
+
+def _loops_open_alone(linkage: Linkage, start: Array) -> Iterator[tuple[str, float]]:
+    """Yield the loops that cannot close near a guess even without the others, with their smallest |phi|."""
+    tree = linkage.tree
+    for loop in linkage.spec.loop:
+        builder = ClosureBuilder(tree, linkage.frames)
+        builder.add_loop(loop)
+        closed = close_loops(tree, builder.build(), start, np.ones(tree.n), EXACT_TOLERANCE * linkage.size)
+        if closed.residual > ROUNDED_TOLERANCE * linkage.size:
+            yield loop.name, closed.residual
 
 
 def _move_within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
@@ -321,25 +357,22 @@ def _move_within_stops(linkage: Linkage, closed: Assembly) -> Assembly:
     return within
 
 
-def _why_not_closed(linkage: Linkage, best: Assembly, start: Array) -> str:
+def _why_not_closed(linkage: Linkage, best: Assembly, start: Array, open_alone: Mapping[str, float]) -> str:
     """Describe the loop with the largest residual, loops that cannot close even alone, and remedies."""
-    loop, miss = max(best.largest_residuals.items(), key=lambda item: item[1])
+    loop, miss = max((open_alone or best.largest_residuals).items(), key=lambda item: item[1])
     message = f"not closed: nearest miss {miss:.3g} m at loop {loop}"
     if miss > 1000 * linkage.size:
         return (
             f"{message}, {miss / linkage.size:.0f} times the mechanism's size of {linkage.size:.3g} m; check the units"
         )
-    alone = []
-    for name in dict.fromkeys(name for name, _ in linkage.closure.names):
-        single = linkage.closure.select_loop(name)
-        closed = close_loops(linkage.tree, single, start, np.ones(linkage.tree.n), EXACT_TOLERANCE * linkage.size)
-        if closed.residual > ROUNDED_TOLERANCE * linkage.size:
-            alone.append(f"{name} (miss {closed.residual:.3g})")
-    types = list_closing_types(linkage.tree, linkage.frames, linkage.spec.loop, linkage.couplings, loop, start)
+    types = []
+    if not open_alone.keys() - {loop}:
+        types = list_closing_types(linkage.tree, linkage.frames, linkage.spec.loop, linkage.couplings, loop, start)
     if types:
         message += f"; all loops would close if loop {loop} had type {' or '.join(types)}"
-    if alone:
-        message += f"; cannot close even alone: {', '.join(alone)}"
+    if open_alone:
+        alone = ", ".join(f"{name} (miss {miss:.3g})" for name, miss in open_alone.items())
+        message += f"; cannot close even alone: {alone}"
     elif len(best.largest_residuals) > 1:
         others = ", ".join(
             f"{k} {x:.3g}" for k, x in best.largest_residuals.items() if x > ROUNDED_TOLERANCE * linkage.size

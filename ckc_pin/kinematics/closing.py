@@ -17,6 +17,8 @@ __all__ = ["EXACT_TOLERANCE", "ROUNDED_TOLERANCE", "Assembly", "close_loops", "f
 
 RESTARTS = 20  # from perturbed guesses
 MAX_ITERATIONS = 100  # of the Gauss-Newton method
+STALL_ITERATIONS = 6  # from a perturbed guess: a smaller decrease of |phi| in so many steps counts as a local minimum
+STALL_DECREASE = 0.01  # relative
 EXACT_TOLERANCE = 1e-10  # mechanism sizes: largest |phi| of a closed mechanism whose numbers are exact
 ROUNDED_TOLERANCE = 1e-5  # the same with numbers rounded to six digits in the files: 2.35619 rad is off by 5e-6
 NEARBY_STEP = 0.02  # rad, or mechanism sizes: distance at which the rank near a closed configuration is computed
@@ -51,6 +53,7 @@ def close_loops(
     restarts: int = RESTARTS,
     bounds: tuple[Array, Array] | None = None,
     rounded: float = 0.0,
+    may_restart: Callable[[], bool] = lambda: True,
 ) -> Assembly:
     """Close the loops near a guess by the damped Gauss-Newton method, with minimum-norm steps.
 
@@ -70,6 +73,8 @@ def close_loops(
     rounded : float
         Largest |phi| that is accepted if rows contradict each other so much. Other guesses are not tried then, since
         they would lead to a different configuration with a slightly smaller residual.
+    may_restart : function
+        Called if the guess does not lead to a closed configuration: whether others are tried.
 
     Returns
     -------
@@ -87,9 +92,9 @@ def close_loops(
         rows = np.eye(tree.n)[beyond != 0]
         return np.concatenate([phi, beyond[beyond != 0]]), lambda: np.vstack([closure.jacobian(pose), rows]) * free
 
-    def outcome(start: Array) -> tuple[Assembly, bool]:
-        """Return the assembly from a guess, and whether it is accepted."""
-        q = _gauss_newton(tree, start, evaluate, tolerance)
+    def outcome(start: Array, open_norm: float = np.inf) -> tuple[Assembly, bool]:
+        """Return the assembly from a guess, and whether it is accepted. It may stall with |phi| > open_norm."""
+        q = _gauss_newton(tree, start, evaluate, tolerance, open_norm)
         phi, _ = evaluate(q)
         open_, excess = (float(np.abs(part).max(initial=0.0)) for part in np.split(phi, [closure.rows]))
         assembly = Assembly(q, max(open_, excess), closure.largest_residuals(phi[: closure.rows]))
@@ -97,36 +102,48 @@ def close_loops(
 
     random = np.random.default_rng(0)  # a fixed seed, so that the result is reproducible
     best, closed = outcome(q_tree)
+    if closed or not restarts or not may_restart():
+        return best
     for attempt in range(restarts):
-        if closed:
-            break
         spread = 0.1 * 1.4**attempt
-        trial, closed = outcome(
-            tree.integrate(q_tree, free * tree.step_scale * random.uniform(-spread, spread, tree.n))
-        )
+        step = free * tree.step_scale * random.uniform(-spread, spread, tree.n)
+        trial, closed = outcome(tree.integrate(q_tree, step), max(tolerance, rounded))
         if closed or trial.residual < best.residual:
             best = trial
+        if closed:
+            break
     return best
 
 
 def _gauss_newton(
-    tree: Tree, q: Array, evaluate: Callable[[Array], tuple[Array, Callable[[], Array]]], tolerance: float
+    tree: Tree,
+    q: Array,
+    evaluate: Callable[[Array], tuple[Array, Callable[[], Array]]],
+    tolerance: float,
+    open_norm: float,
 ) -> Array:
     """Minimize |phi| by minimum-norm Newton steps, each shortened until |phi| decreases.
 
-    `evaluate` returns phi and a function that returns its Jacobian.
+    `evaluate` returns phi and a function that returns its Jacobian. The iteration ends if it stalls at a larger |phi|
+    than `open_norm`.
     """
     phi, jacobian = evaluate(q)
+    norms: list[float] = []
     for _ in range(MAX_ITERATIONS):
         if np.abs(phi).max(initial=0.0) <= 1e-3 * tolerance:
             break
+        norms.append(float(np.linalg.norm(phi)))
+        if len(norms) > STALL_ITERATIONS:
+            stalled = norms[-1] > (1 - STALL_DECREASE) * norms[-1 - STALL_ITERATIONS]
+            if stalled and norms[-1] > open_norm:
+                break
         part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.step_scale, phi, rcond=1e-6)[0], dtype=float)
         longest, step = float(np.abs(part).max(initial=0.0)), part * tree.step_scale
         scale = min(1.0, MAX_NEWTON_STEP / longest) if longest > 0 else 0.0
         while scale > 1e-6:
             trial = tree.integrate(q, scale * step)
             phi_trial, jacobian_trial = evaluate(trial)
-            if np.linalg.norm(phi_trial) < (1 - 1e-4 * scale) * np.linalg.norm(phi):
+            if np.linalg.norm(phi_trial) < (1 - 1e-4 * scale) * norms[-1]:
                 q, phi, jacobian = trial, phi_trial, jacobian_trial
                 break
             scale /= 2

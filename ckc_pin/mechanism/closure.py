@@ -112,12 +112,6 @@ class Closure(Immutable):
             metres[group.out] = group.in_metres(tree)
         return metres
 
-    def select_loop(self, loop: str) -> Closure:
-        """Return a closure with the rows of one loop."""
-        keep = np.array([k for k, (name, _) in enumerate(self.names) if name == loop], np.intp)
-        rows = Selected(self.groups, len(self.names), keep)
-        return Closure(self.anchors, (rows,), tuple(self.names[k] for k in keep), ())
-
     def largest_residuals(self, phi: Array) -> dict[str, float]:
         """Return the largest |phi| of each loop."""
         worst: dict[str, float] = {}

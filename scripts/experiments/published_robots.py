@@ -90,7 +90,10 @@ def _format(error: float | None) -> str:
 
 
 def _shorten(error: Exception, path: Path) -> str:
-    return " ".join(str(error).replace(f"{path}: ", "").replace(str(path.parent), "").split())
+    text = str(error).replace(f"{path}: ", "")
+    for folder in path.parents[:-1]:
+        text = text.replace(f"{folder}/", "")
+    return " ".join(text.split())
 
 
 # Part of a note or warning -> its short form. {n}: number of names after the colon; {m}: number of names before it;

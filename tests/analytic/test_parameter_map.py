@@ -133,18 +133,19 @@ def check(mechanism: Mechanism, names: Iterable[str]) -> int:
 @pytest.mark.parametrize("name", SHIPPED)
 def test_map_equals_rebuilt_shipped_mechanisms(name: str) -> None:
     mechanism = load(name)
-    names = [x for x in with_components(values_of(mechanism.spec, mechanism.urdf)) if is_single(mechanism, x)]
+    names = single_names(mechanism)
     random = np.random.default_rng(5)
     assert check(mechanism, random.permutation(names)[:40]) > 30
 
 
-def is_single(mechanism: Mechanism, name: str) -> bool:
-    return not isinstance(values_of(mechanism.spec, mechanism.urdf).get(name), tuple)
+def single_names(mechanism: Mechanism) -> list[str]:
+    """Return the names of parameters that are one number."""
+    values = values_of(mechanism.spec, mechanism.urdf)
+    return [name for name in with_components(values) if not isinstance(values.get(name), tuple)]
 
 
 def test_map_equals_rebuilt_mechanism_with_every_kind_of_parameter(all_kinds: Mechanism) -> None:
-    names = [x for x in with_components(values_of(all_kinds.spec, all_kinds.urdf)) if is_single(all_kinds, x)]
-    assert check(all_kinds, names) > 150
+    assert check(all_kinds, single_names(all_kinds)) > 150
 
 
 def test_several_parameters_of_one_body_act_together(all_kinds: Mechanism) -> None:

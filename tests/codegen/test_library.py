@@ -6,6 +6,7 @@ import os
 import stat
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,8 +26,9 @@ NAME = "slider_crank"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache."""
+    """An empty cache, in a process that has compiled nothing."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
     return tmp_path / "ckc_pin" / "terms"
 
 
@@ -81,11 +83,15 @@ def test_a_cache_that_others_can_write_to_is_not_used(folder: Path) -> None:
     assert Path(library.compile_terms(load(NAME)).path).parent != folder
 
 
-def test_without_a_writable_cache_the_process_keeps_its_library(folder: Path) -> None:
+def test_without_a_writable_cache_the_process_keeps_its_library(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder.parent.mkdir()
     folder.write_text("no folder")
     assert library.find_compiled_terms(load(NAME)) is None
     assert simulate(NAME, {"t_end": 0.01, "solver.terms": "generated"}).stats["terms"] == "generated"
+    compiled = library.compile_terms(load(NAME)).path
+    assert Path(compiled).parent != folder
+    monkeypatch.setenv("PATH", "")  # without a compiler
+    assert library.compile_terms(load(NAME)).path == compiled
 
 
 def mounted_noexec(parts: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +111,7 @@ def test_libraries_are_not_loaded_from_a_noexec_file_system(folder: Path, monkey
         mounted_noexec((folder,), patch)
         assert library.find_compiled_terms(load(NAME)) is None
         assert Path(library.compile_terms(load(NAME)).path).parent != folder
-    mounted_noexec((folder, Path(tempfile.gettempdir())), monkeypatch)
+    mounted_noexec((folder, Path(tempfile.gettempdir()), library._process_folder()), monkeypatch)
     answer = ckc("compile", NAME)
     assert answer.code == 2
     assert "allows programs" in answer.err

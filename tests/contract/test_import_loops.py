@@ -112,6 +112,23 @@ def test_gazebo_joint_closes_the_loop_at_zero(tmp_path: Path) -> None:
     assert (mechanism.rank, mechanism.d) == (2, 1)
 
 
+def test_gazebo_links_are_read_with_their_poses(tmp_path: Path) -> None:
+    """Link c of the four-bar in Gazebo's format, with both of its joints."""
+    inertia = "<ixx>0.01</ixx><iyy>0.1</iyy><izz>0.1</izz><ixy>0.002</ixy>"
+    inertial = f"<inertial><pose>0.5 0.1 0 0 0 0</pose><mass>1.5</mass><inertia>{inertia}</inertia></inertial>"
+    c = f'<link name="c"><pose>1.7 0 0 0 0 1.5707963267948966</pose>{inertial}</link>'
+    hinge = '<joint name="j3" type="revolute"><parent>w</parent><child>c</child><axis><xyz>0 0 1</xyz></axis></joint>'
+    (tmp_path / "plain").mkdir()
+    plain = imported(tmp_path / "plain", LINKS + UPRIGHT + GAZEBO.format("")).build_mechanism()
+    links = LINKS.replace(f'<link name="c">{BODY}</link>', f"<gazebo>{c}{hinge}</gazebo>")
+    draft = imported(tmp_path, links + UPRIGHT[: UPRIGHT.index('<joint name="j3"')] + GAZEBO.format(""))
+    mechanism = draft.build_mechanism()
+    assert (mechanism.n, mechanism.rank, mechanism.d) == (3, 2, 1)
+    assert draft.origin == "thing.urdf, a URDF with <gazebo><link> and <gazebo><joint>"
+    D = [ckc_pin.terms(x, x.tree.named(x.q_tree)).D for x in (mechanism, plain)]
+    assert_close(D[0], D[1], 1e-12, relative=True)
+
+
 def test_gazebo_plugins_are_read(tmp_path: Path) -> None:
     mimic = (
         '<gazebo><plugin filename="libroboticsgroup_gazebo_mimic_joint_plugin.so" name="m"><joint>j1</joint>'

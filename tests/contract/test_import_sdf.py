@@ -300,6 +300,25 @@ def test_axis_may_be_in_the_frame_of_the_model(version: str, flag: str, tmp_path
     assert_close(placement[1, 9:], [0.0, 0.0, 0.0], 1e-12)
 
 
+@pytest.mark.parametrize(
+    ("kind", "missing", "axes"),
+    [("revolute2", "axis2", ("1 0 0", "0 0 1")), ("universal", "axis axis2", ("1 0 0", "0 1 0"))],
+)
+def test_missing_axes_are_those_of_gazebo_and_said(
+    kind: str, missing: str, axes: tuple[str, str], tmp_path: Path
+) -> None:
+    """Gazebo reads <axis2> of `revolute2` with SDFormat's direction. ODE's universal joint turns about x and y."""
+    one, two = (f"<{tag}><xyz>{xyz}</xyz></{tag}>" for tag, xyz in zip(("axis", "axis2"), axes, strict=True))
+    written = link("a", "0 0 0 0.3 0.4 0.5") + joint("j", "world", "a", kind=kind, axis=axes[0])
+    complete = imported(tmp_path, model(written.replace(one, one + two)))
+    assert not has_note(complete.guessed, "Gazebo's default")
+    draft = imported(tmp_path, model(written.replace(one, "" if "axis axis2" in missing else one)))
+    for tag, xyz in zip(("axis", "axis2"), axes, strict=True):
+        note = f"<{tag}> of {kind} joints is Gazebo's default, {xyz}: j"
+        assert has_note(draft.guessed, note) == (tag in missing.split())
+    assert draft.urdf_text() == complete.urdf_text()
+
+
 def test_gearbox_turns_the_child_against_the_parent(tmp_path: Path) -> None:
     """SDFormat: theta of the child = -ratio * theta of the parent, from the reference body."""
     gear = (

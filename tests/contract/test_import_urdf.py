@@ -145,6 +145,18 @@ def test_rotors_behind_gears_are_those_of_drake(tmp_path: Path) -> None:
     assert_close(np.triu(D), np.triu(theirs), 1e-12)
 
 
+def test_link_without_inertia_is_a_point_mass_as_in_drake(tmp_path: Path) -> None:
+    point = '<inertial><origin xyz="0.3 0.1 0"/><mass value="2"/></inertial>'
+    draft = imported(tmp_path, link("base") + link("arm", point) + joint("a", "base", "arm"))
+    assert has_note(draft.guessed, "links without <inertia> are point masses, as in Drake: arm")
+    mechanism, plant = draft.build_mechanism(), MultibodyPlant(0.0)
+    Parser(plant).AddModelsFromString((tmp_path / "thing.urdf").read_text(), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base"))
+    plant.Finalize()
+    D = pin.crba(mechanism.tree.model, mechanism.tree.data, mechanism.tree.neutral())
+    assert_close(D, plant.CalcMassMatrix(plant.CreateDefaultContext()), 1e-15)
+
+
 def test_trees_beside_the_world_are_free(tmp_path: Path) -> None:
     content = "".join(link(name) for name in ("world", "arm", "body", "leg"))
     draft = imported(tmp_path, content + joint("turn", "world", "arm") + joint("hip", "body", "leg"))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -211,6 +212,48 @@ def tree_terms(mechanism: Any, q: Sequence[float]) -> tuple[Array, Array]:
     model, q_tree = mechanism.tree.model, np.array(q)
     upper = np.triu(pin.crba(model, model.createData(), q_tree))
     return upper + np.triu(upper, 1).T, pin.computeGeneralizedGravity(model, model.createData(), q_tree)
+
+
+OBLIQUE = (0.8, 0.0, 0.6, 0.0)  # a quaternion
+
+
+def join_as_mujoco(writer: Writer, name: str, axis: str, turn: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> Any:
+    """Add a hinge of MuJoCo between bodies a and b, whose frames have one orientation and one origin in each body."""
+    ends = ((np.add(at, (0.1, 0.2, 0.3)), turn), ((-0.1, 0.05, 0.0), turn))
+    prim = writer.joint("RevoluteJoint", name, ("a", "b"), *ends, Axis=axis)
+    prim.SetMetadata("apiSchemas", Sdf.TokenListOp.CreateExplicit(["MjcJointAPI"]))
+    return prim
+
+
+def test_joints_of_two_bodies_from_mujoco_move_one_after_the_other(writer: Writer) -> None:
+    """MuJoCo applies the joints of a body in their order. The third axis is not perpendicular to the others."""
+    for name in "ab":
+        writer.body(name, **LINK)
+    writer.joint("RevoluteJoint", "base", (None, "a"), Axis="Z")
+    straight = (1.0, 0.0, 0.0, 0.0)
+    for name, axis, turn in (("p", "X", straight), ("q", "Z", straight), ("r", "Y", OBLIQUE), ("s", "X", OBLIQUE)):
+        join_as_mujoco(writer, name, axis, turn)
+    draft = writer.read()
+    mechanism = draft.build_mechanism()
+    assert mechanism.coordinates == ("base", "p", "q", "r", "s")
+    assert has_note(draft.guessed, "joints behind another one of the same two bodies, as in MuJoCo: q, r, s")
+    oblique = Rotation.from_quat(OBLIQUE, scalar_first=True).as_matrix()
+    axes = {"p": AXES[0], "q": AXES[2], "r": oblique @ AXES[1], "s": oblique @ AXES[0]}
+    hinges = "".join(
+        f'<joint name="{name}" pos="-0.1 0.05 0" axis="{" ".join(map(str, axis))}"/>' for name, axis in axes.items()
+    )
+    inertial = '<inertial pos="0.1 0 0" mass="1" diaginertia="0.1 0.1 0.1"/>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body><joint name="base" axis="0 0 1"/>{inertial}'
+        f'<body pos="0.2 0.15 0.3">{hinges}{inertial}</body></body></worldbody></mujoco>'
+    )
+    data, theirs = mujoco.MjData(model), np.zeros((5, 5))
+    data.qpos = np.random.default_rng(4).uniform(-1, 1, 5)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, theirs)
+    ours, forces = tree_terms(mechanism, data.qpos)
+    assert_close(ours, theirs, 1e-7, relative=True)  # OBLIQUE has single precision
+    assert_close(forces, data.qfrc_bias, 1e-6)
 
 
 @pytest.mark.parametrize("units", UNITS)
@@ -506,6 +549,12 @@ def add_hinge(*bodies: str | None, **attributes: Any) -> Callable[[Writer], Any]
     return lambda writer: writer.joint("RevoluteJoint", "j", bodies, **attributes)
 
 
+def add_hinges_apart(writer: Writer) -> None:
+    writer.body("b", **LINK)
+    join_as_mujoco(writer, "p", "X", OBLIQUE)
+    join_as_mujoco(writer, "q", "Y", OBLIQUE, (0.0, 0.1, 0.0))
+
+
 BAD: dict[str, tuple[Callable[[Writer], Any], str]] = {
     "missing": (add_hinge(None, "nobody"), r"/chain/j: physics:body1 is /chain/nobody; expected one prim"),
     "itself": (add_hinge("a", "a"), r"/chain/j: it connects 'a' with itself; expected two bodies"),
@@ -516,6 +565,7 @@ BAD: dict[str, tuple[Callable[[Writer], Any], str]] = {
     "limits": (add_hinge(None, "a", LowerLimit=2.0, UpperLimit=1.0), r"joint 'j': its lower limit .* is above"),
     "mass": (lambda writer: writer.body("heavy", None, -1.0), r"/chain/heavy: a negative mass"),
     "nan": (lambda writer: writer.body("heavy", None, math.nan), r"/chain/heavy: physics:mass = nan; expected 1 f"),
+    "apart": (add_hinges_apart, r"/chain/q: at zero it places 'b' elsewhere than joint 'p' does"),
     "flat": (lambda writer: writer.body("flat", np.diag([1.0, 0.0, 1.0, 1.0])), r"/chain/flat: its transform has no"),
     "reference": (add_reference, r"not a complete USD stage: .*nowhere"),
 }  # fmt: skip

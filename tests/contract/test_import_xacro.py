@@ -36,6 +36,13 @@ def test_macros_arguments_and_packages_are_expanded(tmp_path: Path) -> None:
     assert places == {"left_hip": "-1.0 0.0 0.0", "right_hip": "-0.5 0.0 0.0"}
 
 
+def test_package_is_found_by_the_name_in_its_manifest(tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "package.xml").write_text("<package><name> the_parts </name></package>", encoding="utf-8")
+    draft = expanded(tmp_path, ROBOT.replace("$(find parts)", "$(find the_parts)"))
+    assert draft.robot.find("joint[@name='left_hip']") is not None
+
+
 def test_properties_may_begin_with_an_underscore(tmp_path: Path) -> None:
     text = ROBOT.replace('<link name="base"/>', '<xacro:property name="_long" value="0.25"/><link name="base"/>')
     draft = expanded(tmp_path, text.replace("$(arg size)", "${2 * _long}"))

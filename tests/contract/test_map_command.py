@@ -3,12 +3,29 @@
 import numpy as np
 import pytest
 
+import ckc_pin
 from tests.contract.helpers.command import ckc
 
 KEYS = {
     "mechanism", "space", "point", "axes", "held", "measure", "branches", "more_branches", "loci", "desired", "seconds",
     "notes",
 }  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def maps():
+    """Compute each map once. Several tests print it."""
+    compute, done = ckc_pin.singularity_map, {}
+
+    def look_up(mechanism, progress, **options):
+        key = (mechanism, repr(options))
+        if key not in done:
+            done[key] = compute(mechanism, progress=progress, **options)
+        return done[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ckc_pin, "singularity_map", look_up)
+        yield
 
 
 def test_json_and_figures_are_written(tmp_path):

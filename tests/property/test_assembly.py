@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import msgspec
@@ -9,10 +10,10 @@ import numpy as np
 import pytest
 
 from ckc_pin import load
-from ckc_pin.kinematics.assembly import assemble_mechanism
+from ckc_pin.kinematics.assembly import OpenLoopsError, assemble_mechanism
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.spec import LoopType
+from ckc_pin.mechanism.spec import FrameSpec, LoopType
 from tests.contract.sketches import FOUR_BAR, FOUR_BAR_LOOP
 from tests.property.mechanisms import closed_mechanism
 from tests.property.worlds import random_world
@@ -124,3 +125,16 @@ def test_kept_guess_is_on_the_branch_of_the_nearest_closed_configuration() -> No
             continue
         followed = sigma(mechanism, moved.independent_part(moved.q_tree))
         np.testing.assert_allclose(moved.q_tree, followed.at.q_tree, atol=1e-9)
+
+
+def test_message_names_the_loop_that_cannot_close_alone_with_its_miss() -> None:
+    """A plate whose corner 3 is 2 m from corner 1: from base 1 the corner stays 1.6 m away, leg 3 reaches 0.4 m."""
+    mechanism = load("three_rrr")
+    corner_2, corner_3 = mechanism.spec.loop
+    far = msgspec.structs.replace(corner_3, frame_a=FrameSpec(link="plate", xyz=(0.0, -2.0, 0.0)))
+    with pytest.raises(OpenLoopsError, match="cannot close even alone: corner_3 ") as error:
+        assemble_mechanism(msgspec.structs.replace(mechanism.spec, loop=[corner_2, far]), mechanism.sources)
+    miss, alone = (float(x) for x in re.findall(r"miss ([0-9.]+)", str(error.value)))
+    nearest = 2.0 - 0.4 - 0.4 - float(np.hypot(0.303109, 0.525))  # m; the base points' distance is subtracted
+    assert miss == alone
+    assert nearest / np.sqrt(2) <= miss <= nearest  # The message gives the larger component.

@@ -48,8 +48,9 @@ def test_a_motor_on_a_dependent_joint_at_its_limit(formulation: str, terms: str,
     values |= {"controller.K_V": 1.0, "initial.q_dot.theta_1": 0.0}
     names = ["link.link_2.mass", "gravity.y", "joint.theta_2.xyz.x", "controller.K_P", "controller.K_V"]
     names += ["motor.theta_1.ratio", "motor.theta_2.ratio", "motor.theta_2.torque_limit", "initial.q_dot.theta_1"]
-    overrides = {**TIGHT, "formulation": formulation, "solver.terms": terms, "t_end": 0.05, "solver.output_dt": 0.01}
-    result = sensitivities(scene, names, overrides)
+    overrides = {**TIGHT, "formulation": formulation, "t_end": 0.05, "solver.output_dt": 0.01}
+    result = sensitivities(scene, names, {**overrides, "solver.terms": terms})
+    assert result.run.stats["terms"] == terms
     assert result.run.status == "done"
     assert np.all(np.abs(result.run.tau[:, 1]) == 1.0)
 

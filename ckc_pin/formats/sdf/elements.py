@@ -28,6 +28,10 @@ __all__ = [
 
 UNBOUNDED = ("lower", "upper", "effort", "velocity")  # may be infinite
 NO_LIMIT = 1e16  # SDFormat's value for an unlimited joint
+GAZEBO_AXES = {  # of joints without them: the format's direction for a hinge, ODE's and DART's for a universal joint
+    "revolute2": {"axis2": "0 0 1"},
+    "universal": {"axis": "1 0 0", "axis2": "0 1 0"},
+}
 DEFAULT_MASS, DEFAULT_INERTIA = 1.0, 1.0  # kg and kg m^2 of a link that does not give them
 PERPENDICULAR_TOLERANCE = 1e-9
 INERTIA_KEYS = (("ixx", 0, 0), ("iyy", 1, 1), ("izz", 2, 2), ("ixy", 0, 1), ("ixz", 0, 2), ("iyz", 1, 2))
@@ -128,10 +132,13 @@ def _read_visual(element: Element, where: str) -> Element | None:
 # --- joints --------------------------------------------------------------------------------------------------------
 
 
-def read_axes(element: Element, kind: str, rotate: Callable[[Element, Array], Array], where: str) -> list[JointAxis]:
+def read_axes(
+    element: Element, kind: str, rotate: Callable[[Element, Array], Array], where: str, notes: dict[str, list[str]]
+) -> list[JointAxis]:
     """Return the axes of a joint in its frame.
 
-    `rotate` gets an <axis> and its direction as it is written, and returns the direction in the joint's frame.
+    `rotate` gets an <axis> and its direction as it is written, and returns the direction in the joint's frame. `notes`
+    collects the joints' names by what was assumed.
     """
     if kind in ("fixed", "ball"):
         return [] if kind == "fixed" else ball_axes()
@@ -140,7 +147,11 @@ def read_axes(element: Element, kind: str, rotate: Callable[[Element, Array], Ar
     for tag in tags:
         axis = element.find(tag)
         if axis is None:
-            raise InputError(f"{where}: a joint of type {kind!r} has no <{tag}>")
+            if tag not in GAZEBO_AXES.get(kind, {}):
+                raise InputError(f"{where}: a joint of type {kind!r} has no <{tag}>")
+            axis = Element(tag)
+            SubElement(axis, "xyz").text = xyz = GAZEBO_AXES[kind][tag]
+            notes.setdefault(f"<{tag}> of {kind} joints is Gazebo's default, {xyz}", []).append(element.get("name", ""))
         direction = rotate(axis, require_direction(read_numbers(axis, "xyz", "0 0 1", 3, where), f"{where}, <{tag}>"))
         axes.append(_read_axis(axis, direction / np.linalg.norm(direction), kind == "prismatic", f"{where}, <{tag}>"))
     if kind == "screw":

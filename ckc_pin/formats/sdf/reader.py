@@ -295,7 +295,7 @@ class _Reader:
             return pose.rotation.T @ self._axes_of(axis, scope, full_name, pending.version, where) @ direction
 
         poses = [self.frames.pose(link).inverse() * pose for link in links]
-        axes = read_axes(element, kind, rotate, where)
+        axes = read_axes(element, kind, rotate, where, self.notes)
         joint = Joint.between(
             self._short(join(scope, name)), JOINT_KINDS[kind], [*map(self._short, links)], poses, axes
         )

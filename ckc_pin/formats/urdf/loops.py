@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from xml.etree.ElementTree import Element
 
@@ -12,9 +12,17 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError, MechanismError
-from ckc_pin.formats.conversion import make_unique, require_direction, round_number
+from ckc_pin.formats.conversion import list_names, make_unique, require_direction, round_number
 from ckc_pin.formats.robot import Joint, JointAxis, JointKind, Robot, ball_axes
-from ckc_pin.formats.sdf.elements import JOINT_KINDS, attach_links, parse_pose, read_axes, read_number, read_pitch
+from ckc_pin.formats.sdf.elements import (
+    JOINT_KINDS,
+    attach_links,
+    parse_pose,
+    read_axes,
+    read_link,
+    read_number,
+    read_pitch,
+)
 from ckc_pin.formats.urdf.elements import from_pose, parse_vector
 from ckc_pin.mechanism.spec import CouplingSpec
 
@@ -167,13 +175,20 @@ def add_gazebo(robot: Robot, root: Element, unread: Counter[str]) -> list[str]:
 
     Gazebo places a joint in its child, at the poses of the links at zero.
     """
-    dialects = []
+    dialects, notes = list[str](), dict[str, list[str]]()
+    drawn = {}  # poses of Gazebo's own links, relative to the robot's base at zero
+    for element in root.iterfind("gazebo/link"):
+        where = f"{robot.source}: <gazebo> link {element.get('name', '')!r}"
+        robot.links[element.get("name", "")] = read_link(element, where, notes)
+        drawn[element.get("name", "")] = parse_pose(element.find("pose"), where)
     for gazebo in root.findall("gazebo"):
         joint = robot.joints.get(gazebo.get("reference", ""))
         for element in gazebo:
             if element.tag == "joint" and "reference" not in gazebo.attrib:
-                robot.add_joint(_read_gazebo_joint(element, robot))
+                robot.add_joint(_read_gazebo_joint(element, robot, robot.zero_poses() | drawn, notes))
                 dialects.append("<gazebo><joint>")
+            elif element.tag == "link":
+                dialects.append("<gazebo><link>")
             elif element.tag in ("springStiffness", "springReference") and joint is not None and len(joint.axes) == 1:
                 key = "stiffness" if element.tag == "springStiffness" else "rest"
                 setattr(joint.axes[0], key, read_number(element, "", 0.0, f"{robot.source}: joint {joint.name!r}"))
@@ -181,10 +196,13 @@ def add_gazebo(robot: Robot, root: Element, unread: Counter[str]) -> list[str]:
                 dialects += add(element, robot)
             else:
                 unread[f"<{element.tag}> of <gazebo>"] += 1
+    robot.guessed += [f"{what}: {list_names(names)}" for what, names in notes.items()]
     return list(dict.fromkeys(dialects))
 
 
-def _read_gazebo_joint(element: Element, robot: Robot) -> Joint:
+def _read_gazebo_joint(
+    element: Element, robot: Robot, poses: Mapping[str, pin.SE3], notes: dict[str, list[str]]
+) -> Joint:
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{robot.source}: <gazebo> joint {name!r}"
     if kind not in JOINT_KINDS:
@@ -192,14 +210,14 @@ def _read_gazebo_joint(element: Element, robot: Robot) -> Joint:
     links = [(element.findtext(tag) or "").strip() for tag in ("parent", "child")]
     for link, end in zip(links, ("parent", "child"), strict=True):
         _require_link(link, end, robot, where)
-    poses = robot.zero_poses()
     pose = poses[links[1]] * parse_pose(element.find("pose"), where)
 
     def rotate(axis: Element, direction: Array) -> Array:
         uses_model = (axis.findtext("use_parent_model_frame") or "").strip().lower() in ("true", "1")
         return pose.rotation.T @ direction if uses_model else direction
 
-    axes = read_axes(element, kind, rotate, where)
+    axes = read_axes(element, kind, rotate, where, notes)
+    name = make_unique(name, robot.joints)
     joint = Joint.between(name, JOINT_KINDS[kind], links, [poses[link].inverse() * pose for link in links], axes)
     return replace(joint, closes=True, pitch=read_pitch(element, where) if kind == "screw" else 0.0)
 

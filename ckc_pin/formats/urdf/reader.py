@@ -52,6 +52,13 @@ def read_urdf(text: str, path: Path) -> Robot:
     unread = Counter(f"<{e.tag}>" for e in root if e.tag not in READ["robot"])
     for name, element in by_name(root, "link", source).items():
         robot.links[name] = _read_link(element, f"{source}: link {name!r}", unread)
+    points = [
+        element.get("name", "")
+        for element in root.findall("link[inertial]")
+        if element.find("inertial/inertia") is None
+    ]
+    if points:
+        robot.guessed.append(f"links without <inertia> are point masses, as in Drake: {list_names(points)}")
     _add_world(robot, root)
     _add_joints(robot, root, unread)
     gazebo = add_gazebo(robot, root, unread)
@@ -115,8 +122,8 @@ def _read_link(element: Element, where: str, unread: Counter[str]) -> Link:
     link, inertial = Link(visuals=element.findall("visual")), element.find("inertial")
     if inertial is not None:
         (mass,) = floats(_require(inertial, "mass", f"{where}, <inertial>"), "value", 1, None, f"{where}, <mass>")
-        tensor, inertia = _require(inertial, "inertia", f"{where}, <inertial>"), np.zeros((3, 3))
-        for key, (row, column) in INERTIA_ENTRIES.items():
+        tensor, inertia = inertial.find("inertia"), np.zeros((3, 3))
+        for key, (row, column) in INERTIA_ENTRIES.items() if tensor is not None else ():
             inertia[row, column] = inertia[column, row] = floats(tensor, key, 1, None, f"{where}, <inertia>")[0]
         link.body = Body(mass, inertia=inertia).transformed(parse_origin(inertial, f"{where}, <inertial>"))
     return link

@@ -29,6 +29,7 @@ __all__ = ["USD_SUFFIXES", "read_usd"]
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 WORLD = "world"
 EARTH = 9.81  # m/s^2
+SAME_OFFSET = 1e-6  # m; the numbers of a stage are single precision
 EXTENSIONS = r"physx(?!Scene|RigidBody|Articulation|Collision|Material|TriangleMesh|Convex)\w*|mjc|newton"
 IRRELEVANT = (
     r"physics:(startsAsleep|\w*[vV]elocity|approximation|\w+Friction|restitution|type|density|collisionEnabled)"
@@ -54,6 +55,7 @@ class _Reader:
     stage: Stage
     bodies: dict[Any, str] = field(default_factory=dict)  # links by the paths of their prims
     joints: dict[Any, Joint] = field(default_factory=dict)  # by the paths of their prims
+    rows: dict[Any, tuple[Joint, pin.SE3]] = field(default_factory=dict)  # last joints of MuJoCo by their two links
     notes: dict[str, list[str]] = field(default_factory=dict)
     with_gains: list[str] = field(default_factory=list)
 
@@ -141,10 +143,27 @@ class _Reader:
             self._add_motor(robot, freedoms, freedom, label)
         joint = joint.reversed() if links[1] == WORLD else joint
         joint.closes = bool(stage.value(prim, "physics:excludeFromArticulation"))
+        if "MjcJointAPI" in str(prim.GetMetadata("apiSchemas")):  # usd-core does not know this schema
+            self._put_behind(robot, joint, stage.where(prim))
         robot.add_joint(joint)
         self.joints[prim.GetPath()] = joint
         if any(stage.number(prim, f"physics:coneAngle{k}Limit", -1.0, finite=False) >= 0 for k in (0, 1)):
             robot.left_out.append(f"cone limit of joint {name}")
+
+    def _put_behind(self, robot: Robot, joint: Joint, where: str) -> None:
+        """Put a joint of MuJoCo behind the others of the same two bodies, which MuJoCo connects in the order given."""
+        links, offset = (joint.parent, joint.child), joint.in_parent * joint.in_child.inverse()
+        before, expected = self.rows.get(links, (None, offset))
+        self.rows[links] = joint, offset
+        if before is None:
+            return
+        if not offset.isApprox(expected, SAME_OFFSET):
+            raise MechanismError(
+                f"{where}: at zero it places {links[1]!r} elsewhere than joint {before.name!r} does; expected the same"
+            )
+        before.child = joint.parent = make_unique(f"{before.child}_{before.name}", robot.links)
+        robot.links[joint.parent], joint.in_parent = Link(), joint.in_child
+        self.notes.setdefault("joints behind another one of the same two bodies, as in MuJoCo", []).append(joint.name)
 
     def _add_motor(self, robot: Robot, freedoms: JointFreedoms, freedom: str, coordinate: str) -> None:
         if not freedoms.has_drive(freedom):
