@@ -33,7 +33,8 @@ def describe_setup(
     planar = is_planar(mechanism)
     scene = opened.scene
     freedoms = "1 freedom" if mechanism.d == 1 else f"{mechanism.d} freedoms"
-    summary = f"{mechanism.n} coordinates, {mechanism.rank} constraints, {freedoms}"
+    constraints = "open loops" if opened.problem else f"{mechanism.rank} constraints"
+    summary = f"{mechanism.n} coordinates, {constraints}, {freedoms}"
     warnings = [opened.problem] if opened.problem else []
     warnings += [] if mechanism.d else ["the loops leave no freedom: nothing can be moved"]
     joints = range(1, mechanism.tree.model.njoints)

@@ -159,7 +159,7 @@ class Session:
         values = self.mechanism.tree.to_coordinates(self.at.q_tree).tolist()
         report = PoseReport(
             values=dict(zip(self.mechanism.coordinates, values, strict=True)),
-            closure=float(np.abs(self.at.phi).max(initial=0.0)),
+            closure=float(np.abs(at.phi).max(initial=0.0)),
             end=self._end,
             ended=self._ended,
             margins=shown.margins,
@@ -229,7 +229,7 @@ class Session:
                 self._run.release()
             case Move() | Drag() | GoTo() if self._run is None:
                 self._check_goal(request)
-                self._goal, self._is_released = request, False
+                self._goal, self._is_released, self._last_slider = request, False, ""
                 self._hide_branches()
             case Release():
                 if isinstance(self._goal, Drag):  # the mouse may have been released within one frame
@@ -264,7 +264,8 @@ class Session:
 
     def _change(self, request: Request) -> None:
         """Change pose or parameters at once."""
-        self._goal = None
+        if not isinstance(request, SetParameter):
+            self._last_slider = ""
         match request:
             case Undo():
                 self._restore(self.history.undo())

@@ -31,15 +31,28 @@ from ckc_pin.explorer.messages import (
     StopRun,
     Undo,
 )
-from ckc_pin.explorer.opening import open_explored
+from ckc_pin.explorer.opening import Opened, open_explored
 from ckc_pin.explorer.session import Session
+from ckc_pin.kinematics.assembly import open_loops
+from ckc_pin.kinematics.loading import read_spec
 from ckc_pin.kinematics.sigma import assembly_branches, sigma
+from ckc_pin.mechanism.library import MECHANISM_FILE, read_mechanism_texts
 from ckc_pin.view.commands import SceneState
 from tests.analytic.five_bar import FIVE_BAR
 from tests.analytic.test_point import tip
 from tests.conftest import assert_close
 
 PATIENCE = 60.0  # s
+
+
+def as_open(opened, path):
+    """Return a mechanism with its loops open, as if they could not be closed from the guess."""
+    text, sources = read_mechanism_texts(path)
+    sources.texts[MECHANISM_FILE] = text
+    mechanism = opened.mechanism
+    guess = mechanism.tree.named(mechanism.tree.to_coordinates(mechanism.q_tree))
+    as_tree, with_loops = open_loops(read_spec(text, sources.name), sources, guess)
+    return Opened(opened.name, as_tree, as_tree.assembled, with_open_loops=with_loops, problem="made open for the test")
 
 
 class Desk:
@@ -59,7 +72,7 @@ class Desk:
         for _ in range(1000):
             self.session.advance()
             self.session.send_frame()
-            assert self.report("pose")["closure"] <= 1e-10
+            assert self.report("pose")["closure"] <= 1e-10 or self.session.opened.problem
             if not self.session.is_active:
                 return
         raise AssertionError("the movement does not end")
@@ -211,9 +224,38 @@ def test_unassembled_mechanism_is_shown_open_and_closes_when_it_can(open_desk, t
     assert setup["warnings"][0].startswith(str(path))
     assert "not closed" in setup["warnings"][0]
     assert len(setup["coordinates"]) == 4
+    assert desk.report("pose")["closure"] > 1.0
     desk.ask(Move("theta_2", 0.5), Release())
     assert desk.values["theta_2"] == 0.5
     assert "closed" in desk.refused(StartRun())
+
+
+def test_open_loops_close_where_the_user_brings_them_together(open_desk, tmp_path):
+    """A four-bar whose guess is so far away that it does not lead to a closed configuration, then one that does."""
+    path = ckc_pin.load("four_bar").save(tmp_path / "apart")
+    desk = open_desk(path)
+    desk.session._open(as_open(desk.session.opened, path))
+    closed = desk.session.opened.with_open_loops.assembled.q_tree
+    assert desk.report("setup")["warnings"][0] == "made open for the test"
+    name = desk.session.mechanism.coordinates[0]
+    desk.ask(Move(name, desk.values[name] + 0.01), Release())
+    assert not desk.session.opened.problem
+    assert desk.report("pose")["closure"] <= 1e-10
+    assert "closed now" in desk.report("notice")["text"]
+    assert np.abs(desk.session.at.q_tree - closed).max() < 0.1
+
+
+def test_undo_keeps_gestures_between_two_uses_of_one_slider(open_desk):
+    desk = open_desk("five_bar")
+    name, value = "joint.theta_2.xyz.x", 0.2794
+    desk.ask(SetParameter(name, 1.01 * value), SetParameter(name, 1.02 * value))
+    desk.ask(Move("theta_1", -1.3), Release(), SetParameter(name, 1.03 * value))
+    desk.ask(Undo())
+    assert desk.values["theta_1"] == -1.3
+    present = {info["name"]: info["value"] for info in desk.report("setup")["parameters"]}
+    assert present[name] == pytest.approx(1.02 * value, rel=1e-15)
+    desk.ask(Undo(), Undo())
+    assert not desk.report("pose")["can_undo"]
 
 
 def test_mechanism_without_freedoms_says_so(open_desk):

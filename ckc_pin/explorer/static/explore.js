@@ -2,6 +2,7 @@
 // keeps no state of its own. ckc_pin/explorer/messages.py describes the messages.
 var explorer = (function () {
   const RETRY_MS = 1000;
+  const OPEN = 1e-4;  // |phi|, m or rad, of loops that cannot be closed
   const NOTICE_MS = 8000;  // how long a notice is shown that is no error
 
   const MODES = {free: "torque sliders", hold: "hold targets", scene: "the scene's controller"};
@@ -147,7 +148,8 @@ var explorer = (function () {
       });
     });
     setText(element("end"), report.end);
-    setText(element("closure"), "Loops are closed to " + report.closure.toExponential(1) + " (m, rad).");
+    const size = report.closure.toExponential(1) + " (m, rad).";
+    setText(element("closure"), (report.closure < OPEN ? "Loops are closed to " : "Loops are open by ") + size);
     margins.setNames(Object.keys(report.margins));
     margins.forEach((row, name) => row.set(...report.margins[name]));
     quantities.forEach((row, name) => row.setLines(report.quantities[name] || []));
