@@ -26,6 +26,7 @@ __all__ = [
     "BodyForce",
     "Force",
     "LinkForceSpec",
+    "as_vector",
     "body_wrenches",
     "generalized_force",
     "place_forces",
@@ -144,10 +145,11 @@ def _require_vector(value: Any, name: str) -> Array | VectorFunction:
     if callable(value) and not isinstance(value, type):
         require_controller_signature(value, name, "Force")
         return value
-    return _as_vector(value, f"Force: {name}", EXPECTED_VECTOR)
+    return as_vector(value, f"Force: {name}", EXPECTED_VECTOR)
 
 
-def _as_vector(value: Any, what: str, expected: str) -> Array:
+def as_vector(value: Any, what: str, expected: str) -> Array:
+    """Return three finite numbers as an array (InputError, which says what was expected for what)."""
     try:
         vector = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -209,7 +211,7 @@ class BodyForce:
             return self.over_time(t)[0]
         assert self.parts is not None
         place = f"force {self.name!r} at t = {t:.9g}"
-        return np.concatenate([_as_vector(part(t, terms), place, "3 finite numbers") for part in self.parts])
+        return np.concatenate([as_vector(part(t, terms), place, "3 finite numbers") for part in self.parts])
 
 
 def _build_force(force: LinkForceSpec | Force, mechanism: Mechanism, sources: Sources, where: str) -> BodyForce:

@@ -17,7 +17,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
 from ckc_pin.control.controllers import has_state
-from ckc_pin.control.forces import Force
+from ckc_pin.control.forces import Force, as_vector
 from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.sampled import Sampled
 from ckc_pin.dynamics.terms import Terms
@@ -291,8 +291,11 @@ class LiveRun:
         """
         if body not in self._joints:
             raise InputError(f"push: no joint {body!r:.80} moves a body; there are {', '.join(self._joints)}")
-        vectors = [_require_vector(point, "point"), _require_vector(target, "target")]
-        direction = None if normal is None else _require_vector(normal, "normal")
+        vectors = [
+            as_vector(point, "push: point", "3 finite numbers"),
+            as_vector(target, "push: target", "3 finite numbers"),
+        ]
+        direction = None if normal is None else as_vector(normal, "push: normal", "3 finite numbers")
         if direction is not None and np.linalg.norm(direction) > 0:
             direction = direction / np.linalg.norm(direction)
         with self._change:
@@ -636,13 +639,3 @@ def _hold_law(mechanism: Mechanism, at: Kinematics, scene: Scene | None) -> dict
     desired = {name: {"offset": x} for name, x in zip(mechanism.independent, q.tolist(), strict=True)}
     gain = (HOLD_FREQUENCY * 0.5 * (D + D.T)).tolist()
     return {"type": "tracking", "Lambda": HOLD_FREQUENCY, "K_D": gain, "desired": desired, **kept}
-
-
-def _require_vector(value: Any, what: str) -> Array:
-    try:
-        vector = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.zeros(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InputError(f"push: {what}: expected 3 finite numbers, got {describe_value(value)}")
-    return vector
