@@ -10,7 +10,6 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.derivatives import DIRECTIONS
 from ckc_pin.codegen.elimination import elimination_order, saddle_point_matrix, smallest_pivot_ratio
-from ckc_pin.codegen.expressions import kept_rows
 from ckc_pin.codegen.library import Library
 from ckc_pin.dynamics.formulations import dae_acceleration
 from ckc_pin.dynamics.terms import Terms
@@ -85,7 +84,7 @@ def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
         A term differs by more than 1e-11, or eq. 1 cannot be solved without pivoting at any state.
     """
     functions, random = CompiledFunctions(library), np.random.default_rng(0)
-    compared, order = 0, elimination_order(mechanism, kept_rows(mechanism))
+    compared, order = 0, elimination_order(mechanism, mechanism.independent_rows)
     for at, is_closed in _sample_configurations(mechanism, random):
         v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.step_scale
         if is_closed and mechanism.closure.rows:
@@ -157,7 +156,7 @@ def _regular_system(terms: Terms) -> tuple[Array, Array]:
     Where links without mass make D' singular, J^T W J is added. That changes no solution of eq. 1, because such links
     move with the loops. W gives each row the inertia of the other bodies that move with it.
     """
-    D, J = terms.D_tree, terms.at.J[kept_rows(terms.mechanism)]
+    D, J = terms.D_tree, terms.at.J[terms.mechanism.independent_rows]
     if not len(J) or _smallest_scaled_eigenvalue(D) > MASSLESS:
         return D, J
     mobility = np.sum(J * (np.linalg.pinv(D, rcond=MASSLESS, hermitian=True) @ J.T).T, axis=1)
@@ -195,7 +194,7 @@ def _cancels(terms: Terms, u: Array, acceleration: Array) -> bool:
 
 def _closing_step(terms: Terms, residual: Array) -> Array:
     D, J = _regular_system(terms)
-    multipliers = np.linalg.solve(J @ np.linalg.solve(D, J.T), residual[kept_rows(terms.mechanism)])
+    multipliers = np.linalg.solve(J @ np.linalg.solve(D, J.T), residual[terms.mechanism.independent_rows])
     return np.asarray(-np.linalg.solve(D, J.T @ multipliers))
 
 

@@ -15,7 +15,7 @@ from ckc_pin.codegen.rows import RowTerms, row_terms
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 
-__all__ = ["TermExpressions", "kept_rows", "term_expressions"]
+__all__ = ["TermExpressions", "term_expressions"]
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,6 @@ class TermExpressions:
     potential: Any
 
 
-def kept_rows(mechanism: Mechanism) -> list[int]:
-    """Return the constraint rows that the mechanism's rank analysis did not find redundant."""
-    return [k for k, row in enumerate(mechanism.closure.names) if ".".join(row) not in mechanism.redundant]
-
-
 def term_expressions(
     mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, root_groups: Sequence[Sequence[int]] = ()
 ) -> TermExpressions:
@@ -104,7 +99,7 @@ def term_expressions(
     inverse_dynamics = _inertia(mechanism, accelerated, gravity, arguments)[1] + rotor_forces
     elastic, damping, stored = _springs(mechanism, bodies, q, v, arguments)
     rows = row_terms(mechanism.closure, bodies, configuration, v, q_dot, tree.q_index.tolist(), arguments)
-    kept = kept_rows(mechanism)
+    kept = mechanism.independent_rows
     return TermExpressions(
         configuration=configuration,
         v=v,

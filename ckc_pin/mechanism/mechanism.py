@@ -268,6 +268,11 @@ class Mechanism(HasSummary):
         return self.kinematics(self.q_tree)
 
     @property
+    def independent_rows(self) -> list[int]:
+        """Constraint rows that are not redundant."""
+        return [k for k, row in enumerate(self.closure.names) if ".".join(row) not in self.redundant]
+
+    @property
     def independent_root_coordinates(self) -> tuple[str, ...]:
         """Independent coordinates that belong to free roots."""
         return tuple(name for name in self.independent if name in self.tree.free_coordinates)

@@ -51,6 +51,17 @@ class Core:
         Return the acceleration of eq. 1, NaN if J has lost rank; `correction` is added to J_dot v'.
         """
 
+    def allow_elimination(self, allowed: bool) -> None:
+        """
+        Compute accelerations by elimination without pivoting, if there is one, or always by projection.
+        """
+
+    @property
+    def has_elimination(self) -> bool:
+        """
+        Whether accelerations are computed by compiled or sparse elimination without pivoting.
+        """
+
 class View:
     """The state of the loop during a callback."""
 
@@ -709,6 +720,22 @@ class Predictor:
         numbers: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
         w: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
     ) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]: ...
+
+class SparseElimination:
+    """Eliminates eq. 1 in sparse matrices, without pivoting."""
+
+    def __init__(self, core: dict[str, Any]) -> None: ...
+    def acceleration(
+        self,
+        q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        v_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        u_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    ) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")] | None:
+        """Return the acceleration of eq. 1; None if a pivot is small."""
+
+    @property
+    def operations(self) -> int:
+        """Multiplications of a factorization and a solution."""
 
 class Turn:
     """Holds a gate's lock within a `with` block."""

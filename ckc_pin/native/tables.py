@@ -41,6 +41,7 @@ def core_table(mechanism: Mechanism, library: Library | None = None, smoothing: 
         "joints": _joints(mechanism, smoothing),
         "rotors": mechanism.tree.rotors.ravel() if mechanism.tree.rotors.any() else np.zeros(0),
         "rank": mechanism.rank,
+        "independent_rows": mechanism.independent_rows,
         "q": mechanism.partition.q.tolist(),
         "z": mechanism.partition.z.tolist(),
         "row_scale": rows,

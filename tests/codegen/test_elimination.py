@@ -8,7 +8,6 @@ import pytest
 
 from ckc_pin import load
 from ckc_pin.codegen.elimination import SymmetricFactor, elimination_order
-from ckc_pin.codegen.expressions import kept_rows
 from ckc_pin.dynamics import Terms
 from ckc_pin.kinematics.sigma import sigma
 
@@ -66,7 +65,7 @@ def test_a_cancelled_pivot_is_not_accurate() -> None:
 def test_pivots_of_a_mechanism_are_not_small(name: str) -> None:
     """The elimination order was chosen at other configurations than these."""
     mechanism, random = load(name), np.random.default_rng(4)
-    kept, n = kept_rows(mechanism), mechanism.n
+    kept, n = mechanism.independent_rows, mechanism.n
     order = elimination_order(mechanism, kept)
     assert sorted(order) == list(range(n + len(kept)))
     q = mechanism.independent_part(mechanism.q_tree)
@@ -90,6 +89,6 @@ def test_pivots_of_a_mechanism_are_not_small(name: str) -> None:
 def test_arms_of_the_delta_are_eliminated_before_the_plate() -> None:
     """Fifteen coordinates of the arms and fifteen rows come before the plate's coordinates."""
     mechanism = load("delta")
-    order = elimination_order(mechanism, kept_rows(mechanism))
+    order = elimination_order(mechanism, mechanism.independent_rows)
     plate = [mechanism.coordinates.index(f"plate_place.{x}") for x in ("x", "y", "z", "rx", "ry", "rz")]
     assert min(order.index(k) for k in plate) == 30

@@ -113,6 +113,7 @@ std::unique_ptr<Core> core_from_table(const nb::dict& table) {
       joints_from_table(get<nb::dict>(table, "joints")),
       get<Vector>(table, "rotors"),
       get<int>(table, "rank"),
+      get<Indices>(table, "independent_rows"),
       {get<Vector>(table, "row_scale"), get<Vector>(table, "column_scale"), get<double>(table, "rank_tolerance")},
       table.contains("compiled") ? compiled_terms_from(get<nb::tuple>(table, "compiled")) : nullptr,
   });
@@ -221,7 +222,11 @@ void bind_core(nb::module_& m) {
       .def("reduced_acceleration", &reduced_acceleration, "q_tree"_a, "q_dot"_a, "v_tree"_a, "u_tree"_a, "actual"_a,
            "Return q_ddot of eq. 6, with C at v' = rho q_dot or, if `actual`, at v_tree.")
       .def("dae_acceleration", &dae_acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a, "correction"_a,
-           "Return the acceleration of eq. 1, NaN if J has lost rank; `correction` is added to J_dot v'.");
+           "Return the acceleration of eq. 1, NaN if J has lost rank; `correction` is added to J_dot v'.")
+      .def("allow_elimination", &Core::allow_elimination, "allowed"_a,
+           "Compute accelerations by elimination without pivoting, if there is one, or always by projection.")
+      .def_prop_ro("has_elimination", &Core::has_elimination,
+                   "Whether accelerations are computed by compiled or sparse elimination without pivoting.");
 }
 
 }  // namespace ckc

@@ -5,6 +5,7 @@
 #include <nanobind/stl/pair.h>
 
 #include "bind/run.hpp"
+#include "loops/sparse_elimination.hpp"
 #include "tree/rotation.hpp"
 #include "motion/stiffness.hpp"
 
@@ -51,6 +52,24 @@ struct BoundPredictor {
     Vector q_tree(core->tree.nq);
     predictor.predict(t, numbers, chart, *core, w, q_tree);
     return q_tree;
+  }
+};
+
+// Sparse elimination for a mechanism of any size, even if projection is cheaper.
+struct BoundSparseElimination {
+  std::unique_ptr<Core> core;
+  SparseElimination elimination;
+
+  BoundSparseElimination(const nb::typed<nb::dict, nb::str, nb::any>& table)
+      : core(core_from_table(table)),
+        elimination(core->tree.inertia_pattern, core->constraints.relative_pattern,
+                    get<Indices>(table, "independent_rows")) {}
+  std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
+    core->set_configuration(q_tree, true), core->set_velocity(v_tree), core->compute_J(), core->compute_bias();
+    if (!elimination.compute(core->tree.D(), core->constraints.J)) return std::nullopt;
+    Vector a(core->n);
+    elimination.solve(u_tree - core->bias_tree + core->damping_tree, core->J_dot_v, a);
+    return a;
   }
 };
 
@@ -130,6 +149,12 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
            "epsilon"_a)
       .def("add", &BoundPredictor::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("predict", &BoundPredictor::predict, "t"_a, "numbers"_a, "w"_a);
+  nb::class_<BoundSparseElimination>(m, "SparseElimination", "Eliminates eq. 1 in sparse matrices, without pivoting.")
+      .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&>(), "core"_a)
+      .def("acceleration", &BoundSparseElimination::acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a,
+           "Return the acceleration of eq. 1; None if a pivot is small.")
+      .def_prop_ro("operations", [](const BoundSparseElimination& of) { return of.elimination.operations(); },
+                   "Multiplications of a factorization and a solution.");
   binding
       .def("rank", &rank, "y"_a,
            "Return the rank monitor's smallest singular value of J and its rate at a DAE's state.")

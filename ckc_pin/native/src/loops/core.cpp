@@ -1,5 +1,6 @@
 #include "loops/core.hpp"
 #include "loops/compiled_terms.hpp"
+#include "loops/sparse_elimination.hpp"
 
 #include <Eigen/LU>
 
@@ -12,6 +13,8 @@ namespace ckc {
 // nonzero entries than the second.
 constexpr int max_sparse_size = 12;
 constexpr double min_dense_share = 0.2;
+// Duration of a multiplication in sparse elimination, in units of one in projection, which works on dense columns.
+constexpr double sparse_cost = 4.0;
 
 Core::Core(CoreTable table)
     : tree(table.model, std::move(table.q_index)),
@@ -24,6 +27,7 @@ Core::Core(CoreTable table)
       d(0),
       compiled(std::move(table.compiled)),
       derivatives(tree, constraints.closure, springs.table),
+      independent_rows_(std::move(table.independent_rows)),
       qr_(std::max(constraints.closure.rows, 1), n) {
   const int m = constraints.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n),
@@ -38,6 +42,19 @@ Core::Core(CoreTable table)
   size_t entries = 0;
   for (const Indices& rows : tree.inertia_pattern) entries += 2 * rows.size();
   D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
+  choose_sparse_elimination();
+}
+
+// Use sparse elimination if it costs less than projection: D' T, T^T D' T and its Cholesky factorization.
+void Core::choose_sparse_elimination() {
+  sparse_.reset();
+  const double size = n, d = n - rank;
+  if (compiled || n <= max_sparse_size || static_cast<int>(independent_rows_.size()) != rank) return;
+  double inertia_entries = 0.0;
+  for (const Indices& rows : tree.inertia_pattern) inertia_entries += 2.0 * static_cast<double>(rows.size()) - 1.0;
+  const double projection = d * (D_tree_is_dense_ ? size * size : inertia_entries) + size * d * d + d * d * d / 6.0;
+  auto sparse = std::make_unique<SparseElimination>(tree.inertia_pattern, constraints.relative_pattern, independent_rows_);
+  if (sparse_cost * static_cast<double>(sparse->operations()) < projection) sparse_ = std::move(sparse);
 }
 
 Core::~Core() = default;
@@ -86,6 +103,7 @@ void Core::set_parameters(Parameter parameter, In values) {
     constraints.set_parameters(static_cast<ConstraintRows::Parameter>(offset_from(Parameter::point)), values);
   else
     tree.set_parameters(static_cast<Tree::Parameter>(k), values);
+  if (parameter == Parameter::rotors) choose_sparse_elimination();  // rotors between branches couple coordinates
   valid_parts_ = 0, basis_configuration_ = -1, ++configuration_count;
 }
 

@@ -16,6 +16,7 @@
 namespace ckc {
 
 class CompiledTerms;
+class SparseElimination;
 
 struct Energy {
   double kinetic, potential;  // J; potential: of gravity, springs and constant forces
@@ -41,6 +42,7 @@ struct CoreTable {
   JointTable joints;
   Vector rotors;  // (n * n), as Tree::Parameter::rotors; empty without motors on several joints that have a rotor
   int rank;  // of J at a regular configuration
+  Indices independent_rows;
   Scales scales;
   std::unique_ptr<CompiledTerms> compiled;  // null: Pinocchio's terms
 };
@@ -174,11 +176,17 @@ class Core {
   const Indices& basis_coordinates() const { return basis_coordinates_; }
   // A solution x of J x = -residual; requires a tangent basis.
   void particular_solution(In residual, Out x);
-  // Acceleration of eq. 1, by compiled elimination or by projection on the tangent space; `correction` is added to
+  // Acceleration of eq. 1, by elimination or by projection on the tangent space; `correction` is added to
   // J_dot v. False if J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // Relative rounding errors of the acceleration at the core's state: of compiled elimination compared with
-  // projection (even if elimination is not allowed), and of projection compared with projection by mass levels. Zero
+  // Elimination of eq. 1 without pivoting, by the compiled terms or in sparse matrices. It may be used if
+  // `allow_elimination` says so (loops/elimination_check.hpp decides). False if there is none, it is not allowed, or a
+  // pivot is small.
+  bool has_elimination() const { return compiled || sparse_; }
+  void allow_elimination(bool allowed);
+  bool eliminate(In u_tree, In correction, Out acceleration);
+  bool elimination_step(In residual, Out x);  // as `closure_step`
+  // Relative rounding errors of the acceleration at the core's state: of elimination compared with projection, and of projection compared with projection by mass levels. Zero
   // if the reference does not exist.
   double rounding_of_elimination(In u_tree);
   double rounding_of_projection(In u_tree);
@@ -246,6 +254,8 @@ class Core {
   void body_velocity_components(Components& of);
   bool find_basis_for_check();                      // by pivoting; the basis is not used later
   void project_on_tangent_space(In u_tree, Out a);  // eq. 1, requires tangent_ and x_
+  void choose_sparse_elimination();
+  bool factorize_sparsely();
   bool project_by_mass_levels(In u_tree, Out a);    // the same; false if some motion moves no mass
   double relative_difference(In a, In reference);   // requires project_on_tangent_space
   bool find_basis_by_partition();
@@ -255,6 +265,10 @@ class Core {
 
   bool D_tree_is_dense_;
   bool uses_mass_levels_ = false;
+  const Indices independent_rows_;
+  std::unique_ptr<SparseElimination> sparse_;  // null if projection is cheaper
+  bool sparse_allowed_ = true, sparse_is_accurate_ = false;
+  long sparse_configuration_ = -1;  // `configuration_count` of the last sparse factorization
   unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
   Matrix C_tree_, D_compiled_, D_rho_, tangent_, D_tangent_;
   Indices basis_coordinates_;           // by column of the tangent basis: its coordinate

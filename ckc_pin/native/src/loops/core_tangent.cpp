@@ -7,6 +7,7 @@
 
 #include "loops/core.hpp"
 #include "loops/compiled_terms.hpp"
+#include "loops/sparse_elimination.hpp"
 
 namespace ckc {
 
@@ -132,12 +133,43 @@ void Core::closure_step_in_z(In residual, Out x) {
   for (size_t k = 0; k < z.size(); ++k) x(z[k]) = -z_(k);
 }
 
+void Core::allow_elimination(bool allowed) {
+  sparse_allowed_ = allowed;
+  if (compiled) compiled->allow_elimination(allowed);
+}
+
+bool Core::factorize_sparsely() {
+  if (!sparse_ || !sparse_allowed_ || compiled || !released_.empty() || uses_mass_levels_) return false;
+  if (sparse_configuration_ == configuration_count) return sparse_is_accurate_;
+  compute_J(), compute_D_tree();
+  sparse_configuration_ = configuration_count;
+  return sparse_is_accurate_ = sparse_->compute(D_tree(), constraints.J);
+}
+
+bool Core::eliminate(In u_tree, In correction, Out acceleration) {
+  if (compiled) return compiled_acceleration(q_tree, v_tree, u_tree, correction, acceleration);
+  if (!factorize_sparsely()) return false;
+  compute_bias();
+  residual_ = J_dot_v + correction;
+  y_ = u_tree - bias_tree + damping_tree;
+  sparse_->solve(y_, residual_, acceleration);
+  return true;
+}
+
+bool Core::elimination_step(In residual, Out x) {
+  if (compiled) return compiled->closure_step(q_tree, residual, x);
+  if (!factorize_sparsely()) return false;
+  y_.setZero();
+  sparse_->solve(y_, residual, x);
+  return true;
+}
+
 bool Core::cheapest_closure_step(In residual, Out x) {
   return (compiled && compiled->closure_step(q_tree, residual, x)) || minimum_norm_closure_step(residual, x);
 }
 
 bool Core::closure_step(In residual, Out x) {
-  if (compiled && compiled->closure_step(q_tree, residual, x)) return true;
+  if (elimination_step(residual, x)) return true;
   return inertia_metric_step(residual, min_pivot_for_inertia_metric, x) || minimum_norm_closure_step(residual, x);
 }
 
@@ -170,7 +202,7 @@ void Core::particular_solution(In residual, Out x) {
 }
 
 bool Core::dae_acceleration(In u_tree, In correction, Out acceleration) {
-  if (compiled_acceleration(q_tree, v_tree, u_tree, correction, acceleration)) return true;
+  if (eliminate(u_tree, correction, acceleration)) return true;
   compute_bias();
   residual_ = J_dot_v + correction;
   if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
@@ -255,7 +287,9 @@ double Core::relative_difference(In a, In reference) {
 double Core::rounding_of_elimination(In u_tree) {
   Vector by_elimination(n), reference(n);
   residual_.setZero();
-  if (!compiled->eliminate(q_tree, v_tree, u_tree, residual_, by_elimination) || !find_basis_for_check()) return 0.0;
+  const bool exists = compiled ? compiled->eliminate(q_tree, v_tree, u_tree, residual_, by_elimination)
+                               : eliminate(u_tree, residual_, by_elimination);
+  if (!exists || !find_basis_for_check()) return 0.0;
   project_on_tangent_space(u_tree, reference);
   if (!uses_mass_levels_) return relative_difference(by_elimination, reference);
   Vector by_levels(n);
@@ -306,11 +340,12 @@ void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In fo
 bool Core::unit_force_responses(const Indices& at, Matrix& columns) {
   columns.resize(n, static_cast<Eigen::Index>(at.size()));
   residual_.setZero();
-  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
-  factorize_tangent_inertia();
+  const bool is_sparse = factorize_sparsely();
+  if (!is_sparse && !find_tangent_basis(residual_, rank_lost_pivot)) return false;
+  if (!is_sparse) factorize_tangent_inertia();
   for (size_t k = 0; k < at.size(); ++k) {
     y_.setUnit(at[k]);
-    add_force_response(y_, columns.col(k));
+    is_sparse ? sparse_->solve(y_, residual_, columns.col(k)) : add_force_response(y_, columns.col(k));
   }
   for (size_t k = 0; k < at.size() && has_released_rows(); ++k) {
     y_.setUnit(at[k]);
@@ -343,6 +378,11 @@ bool Core::differentiate(In u_tree, In acceleration) {
 
 bool Core::solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& derivatives) {
   derivatives.resize(n, force.cols());
+  if (factorize_sparsely()) {
+    for (Eigen::Index k = 0; k < force.cols(); ++k)
+      sparse_->solve(force.col(k), residual.col(k), derivatives.col(k));
+    return true;
+  }
   for (Eigen::Index k = 0; k < force.cols(); ++k) {
     residual_ = residual.col(k);
     if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;

@@ -1,7 +1,6 @@
 #include "loops/elimination_check.hpp"
 
 #include "loops/core.hpp"
-#include "loops/compiled_terms.hpp"
 
 namespace ckc {
 
@@ -12,26 +11,26 @@ constexpr double max_rounding_per_coordinate = 5e-14;
 constexpr int first_interval = 8, regular_interval = 128, retry_interval = 16;
 
 // Project (q', v') onto the constraint manifold. Off the manifold redundant rows contradict each other, so that
-// eliminations which use different rows differ. False if the compiled elimination would need a pivot.
+// eliminations which use different rows differ. False if elimination would need a pivot.
 static bool project_onto_manifold(Core& core, Vector& q_tree, Vector& v) {
   constexpr int newton_steps = 3;  // starting from a state within the run's tolerance
   Vector step(core.n);
   for (int k = 0; k < newton_steps; ++k) {
     core.set_configuration(q_tree);
-    if (!core.compiled->closure_step(q_tree, core.constraints.phi, step)) return false;
+    if (!core.elimination_step(core.constraints.phi, step)) return false;
     core.tree.integrate(q_tree, step);
   }
   core.set_configuration(q_tree);
-  if (!core.compiled->closure_step(q_tree, core.constraints.J * v, step)) return false;
+  if (!core.elimination_step(core.constraints.J * v, step)) return false;
   v += step;
   return true;
 }
 
 void EliminationCheck::reset(Core& core) {
-  if (core.compiled) core.compiled->allow_elimination(true);
+  core.allow_elimination(true);
   has_uneven_masses_ = core.has_uneven_masses();
   core.use_mass_levels(false);
-  is_active_ = has_uneven_masses_ || core.compiled;
+  is_active_ = has_uneven_masses_ || core.has_elimination();
   has_started_ = is_remembered_ = false, steps_until_check_ = 0, next_interval_ = first_interval;
 }
 
@@ -50,9 +49,9 @@ void EliminationCheck::accept_step(Core& core) {
     check(core);
 }
 
-bool EliminationCheck::disable_compiled_elimination(Core& core) {
-  if (!core.compiled || !is_active_) return false;
-  core.compiled->allow_elimination(false);
+bool EliminationCheck::disable_elimination(Core& core) {
+  if (!core.has_elimination() || !is_active_) return false;
+  core.allow_elimination(false);
   is_active_ = false;
   return true;
 }
@@ -65,8 +64,8 @@ void EliminationCheck::check(Core& core) {
   if (has_uneven_masses_ && !core.uses_mass_levels())
     core.use_mass_levels(core.rounding_of_projection(u_tree_) > limit);
   bool is_accurate = true;
-  if (core.compiled) {
-    core.compiled->allow_elimination(true);
+  if (core.has_elimination()) {
+    core.allow_elimination(true);
     const bool redundant = core.rank < core.constraints.closure.rows;
     Vector q_tree = q_tree_, v = v_;
     if (!redundant || project_onto_manifold(core, q_tree, v)) {
@@ -74,7 +73,7 @@ void EliminationCheck::check(Core& core) {
       is_accurate = core.rounding_of_elimination(u_tree_) <= limit;
     }
     if (redundant) core.set_configuration(q_tree_), core.set_velocity(v_);
-    core.compiled->allow_elimination(is_accurate);
+    core.allow_elimination(is_accurate);
   }
   steps_until_check_ = is_accurate ? next_interval_ : retry_interval;
   next_interval_ = regular_interval;

@@ -1,7 +1,7 @@
 // Chooses the elimination by which a run computes the acceleration of eq. 1, from its rounding errors at the start
 // and along the motion.
 //
-// The compiled elimination does not pivot, and its order was chosen for the masses in the mechanism's files. With very
+// Elimination does not pivot, and compiled terms have an order for the masses in the mechanism's files. With very
 // different masses its rounding errors can be a million times those of projection on the tangent space: if a light body
 // carries a heavy load, the acceleration that the load alone would cause cancels. Step size control then sees noise.
 #pragma once
@@ -23,8 +23,8 @@ class EliminationCheck {
   void remember_state(In q_tree, In v, In u_tree) { q_tree_ = q_tree, v_ = v, u_tree_ = u_tree, is_remembered_ = true; }
   // Call after a step is accepted. If a check is due, the core is left at the remembered configuration.
   void accept_step(Core& core);
-  // Do not use the compiled elimination for the rest of the run. False if there is none or it is already disabled.
-  bool disable_compiled_elimination(Core& core);
+  // Do not use elimination for the rest of the run. False if there is none or it is already disabled.
+  bool disable_elimination(Core& core);
 
  private:
   void check(Core& core);

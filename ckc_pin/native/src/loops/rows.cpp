@@ -49,7 +49,7 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   p_.resize(2 * pair_count_), p_dot_.resize(2 * pair_count_), r_.resize(pair_count_), r_dot_.resize(pair_count_);
   e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
   velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
-  wrenches_.resize(c.rows), pattern.resize(c.rows);
+  wrenches_.resize(c.rows), pattern.resize(c.rows), relative_pattern.resize(c.rows);
   const auto joints = [&](int out, std::initializer_list<int> list) {
     for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
   };
@@ -78,6 +78,14 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
     for (const auto& curve : c.curves)
       if (curve.out == i) columns.insert(curve.coordinate);
     pattern[i].assign(columns.begin(), columns.end());
+    for (int j : pattern[i]) {
+      const auto moves = [&](const Wrench& wrench) {
+        const auto& support = tree.support[wrench.joint];
+        return std::binary_search(support.begin(), support.end(), j);
+      };
+      if (wrenches_[i].empty() || !std::all_of(wrenches_[i].begin(), wrenches_[i].end(), moves))
+        relative_pattern[i].push_back(j);
+    }
   }
 }
 

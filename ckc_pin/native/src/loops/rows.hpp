@@ -65,8 +65,10 @@ class ConstraintRows {
 
   Closure closure;
   std::vector<Indices> pattern;  // by row: columns of J that are not zero
-  Vector phi;                    // (rows)
-  Matrix J, J_dot;               // (rows, n); zero outside the pattern
+  // The same without coordinates that move everything the row is attached to: in their columns J is a rounding error.
+  std::vector<Indices> relative_pattern;
+  Vector phi;       // (rows)
+  Matrix J, J_dot;  // (rows, n); zero outside the pattern
 
   // Replace one kind of parameter: points concatenated; lengths, coefficients and offsets of all rows.
   enum class Parameter { point, length, affine, affine_offset };

@@ -134,10 +134,9 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   // On the manifold eq. 6 equals eq. 1 at rho q_dot.
   const Vector& force = applied_force(v_tree);
   const bool locked = !core.joints.locked.empty();
-  const bool compiled = on_manifold_ && core.compiled && !locked && !core.has_released_rows();
-  has_tree_acceleration_ =
-      compiled && core.compiled_acceleration(core.q_tree, v_tree, force, row_correction_, a_tree_);
-  if (compiled && !has_tree_acceleration_) ++counts.general_rhs;
+  const bool eliminates = on_manifold_ && core.has_elimination() && !locked && !core.has_released_rows();
+  has_tree_acceleration_ = eliminates && core.eliminate(force, row_correction_, a_tree_);
+  if (eliminates && core.compiled && !has_tree_acceleration_) ++counts.general_rhs;
   if (!has_tree_acceleration_ && (locked || core.has_row_motion() || (on_manifold_ && core.uses_mass_levels()))) {
     if (!acceleration_with_held_joints(v_tree, row_correction_, a_tree_)) return false;
     has_tree_acceleration_ = true;
@@ -226,7 +225,7 @@ void LevelSet::resume(double t, Out y) {
 bool LevelSet::return_to_accepted() {
   ++disagreements_, rejection_balance_ += rejection_weight;
   if (rejection_balance_ > max_rejection_balance) {
-    if (!elimination.disable_compiled_elimination(core)) return fail(RhsFailure::z_inaccurate);
+    if (!elimination.disable_elimination(core)) return fail(RhsFailure::z_inaccurate);
     rejection_balance_ = 0.0;  // steps may succeed with the other elimination
   }
   search_margin_ = std::numeric_limits<double>::infinity();

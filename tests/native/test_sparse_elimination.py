@@ -1,0 +1,223 @@
+"""Sparse elimination of eq. 1 equals dense solutions, and its work grows in proportion to chains of loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+from ckc_pin import Mechanism, Scene, simulate
+from ckc_pin.dynamics import Terms
+from ckc_pin.kinematics.loading import build, load
+from ckc_pin.mechanism.library import GeneratorSpec, generate, shipped
+from ckc_pin.native import _core
+from ckc_pin.native.tables import core_table
+from scripts.experiments.benchmark.growth import Case, exponent, write_case
+from scripts.experiments.mechanism_files import WIDE_LIMIT, urdf_joint, urdf_link, urdf_robot
+from tests.property.mechanisms import closed_mechanism
+
+KINDS = ("point", "point_2d", "hinge", "cylindrical", "universal", "prismatic", "weld", "distance")
+TOLERANCE = 1e-11
+LINKS, LOOPS, MIN_JOINTS_IN_LOOP = 40, 6, 6  # of a random tree
+
+
+def dense_acceleration(terms, u_tree):
+    """Solve eq. 1 without its redundant rows by LU with pivoting."""
+    rows, n = terms.mechanism.independent_rows, terms.mechanism.n
+    D, J = np.triu(terms.D_tree), terms.at.J[rows]
+    D = D + np.triu(D, 1).T
+    A = np.block([[D, J.T], [J, np.zeros((len(rows), len(rows)))]])
+    force = u_tree - terms.bias_tree + terms.damping_force
+    return np.linalg.solve(A, np.concatenate([force, -terms.J_dot[rows] @ terms.v_tree]))[:n]
+
+
+def relative_error(computed, expected):
+    return np.abs(computed - expected).max() / np.abs(expected).max()
+
+
+def random_tree(seed, *, free=False):
+    """Return a mechanism of a random tree whose point loops are closed at its assembled configuration."""
+    random = np.random.default_rng(seed)
+    parents = [int(random.integers(max(0, k - 4), k)) for k in range(1, LINKS + 1)]
+    elements = [urdf_link("0", 1.0, np.zeros(3), np.eye(3))]
+    for k, parent in enumerate(parents, 1):
+        mass, xyz, axis = random.uniform(0.5, 2.0), random.uniform(-0.5, 0.5, 3), random.normal(size=3)
+        elements.append(urdf_link(str(k), mass, random.uniform(-0.2, 0.2, 3), 0.1 * mass * np.eye(3)))
+        elements.append(urdf_joint(f"j{k}", "revolute", str(parent), str(k), xyz, (0.1, 0.2, 0.3), axis, WIDE_LIMIT))
+    text = urdf_robot("random", elements)
+    model = pin.buildModelFromXML(text)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, np.zeros(model.nq))
+    placement = [data.oMf[model.getFrameId(str(k))] for k in range(LINKS + 1)]
+    moving = {0: set()}  # by link: the joints that move it
+    for k, parent in enumerate(parents, 1):
+        moving[k] = moving[parent] | {k}
+    loops = []
+    while len(loops) < LOOPS:
+        a, b = random.choice(LINKS + 1, 2, replace=False)
+        if len(moving[a] ^ moving[b]) < MIN_JOINTS_IN_LOOP:
+            continue
+        xyz = random.uniform(-0.3, 0.3, 3)
+        frames = [(a, xyz), (b, placement[b].actInv(placement[a].act(xyz)))]
+        frame_a, frame_b = ({"link": str(link), "xyz": at.tolist()} for link, at in frames)
+        loops.append({"name": f"loop_{len(loops)}", "type": "point", "frame_a": frame_a, "frame_b": frame_b})
+    return Mechanism.from_urdf(trees=[{"file": text, "root": "free" if free else "fixed"}], loops=loops)
+
+
+def random_states(mechanism, count, seed, spread=0.1):
+    """Yield terms at random states near the assembled configuration, off the manifold, and random forces."""
+    random, n = np.random.default_rng(seed), mechanism.n
+    for _ in range(count):
+        at = mechanism.kinematics(mechanism.tree.integrate(mechanism.q_tree, spread * random.uniform(-1, 1, n)))
+        yield Terms(mechanism, at, random.uniform(-1, 1, n)), random.uniform(-5, 5, n)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_shipped_mechanisms_equal_a_dense_solution(name):
+    mechanism = load(name)
+    elimination = _core.SparseElimination(core_table(mechanism))
+    solved = 0
+    for terms, u_tree in random_states(mechanism, 50, seed=0):
+        computed, expected = (
+            elimination.acceleration(terms.q_tree, terms.v_tree, u_tree),
+            dense_acceleration(terms, u_tree),
+        )
+        if computed is not None:
+            solved += 1
+            assert relative_error(computed, expected) <= TOLERANCE
+    assert solved >= 45
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "variant", [{}, {"free": False}, {"redundant": True}, {"nonlinear": True}, {"rows_in": "world"}]
+)
+def test_random_loops_equal_a_dense_solution(kind, variant):
+    closed = closed_mechanism(kind, seed=12, **variant)
+    elimination = _core.SparseElimination(core_table(closed.mechanism))
+    solved = 0
+    for terms, u_tree in random_states(closed.mechanism, 20, seed=1):
+        computed, expected = (
+            elimination.acceleration(terms.q_tree, terms.v_tree, u_tree),
+            dense_acceleration(terms, u_tree),
+        )
+        if computed is not None:
+            solved += 1
+            assert relative_error(computed, expected) <= TOLERANCE
+    assert solved >= 15
+
+
+@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_core_equals_constraint_dynamics_of_pinocchio(seed, free):
+    """Of a random tree with 40 joints and six loops, at its assembled configuration, where the loops are closed."""
+    mechanism = random_tree(seed, free=free)
+    core, random, n = _core.Core(core_table(mechanism)), np.random.default_rng(seed), mechanism.n
+    assert core.has_elimination
+    model, anchors = mechanism.tree.model, mechanism.closure.anchors
+    points = [pin.SE3(np.eye(3), np.array(xyz)) for xyz in anchors.point_local]
+    joints, pairs = [int(k) for k in anchors.point_joint], len(points) // 2
+    constraints = pin.StdVec_RigidConstraintModel()
+    for k in range(pairs):
+        constraints.append(pin.RigidConstraintModel(
+            pin.ContactType.CONTACT_3D, model, joints[k], points[k], joints[pairs + k], points[pairs + k],
+            pin.ReferenceFrame.LOCAL))  # fmt: skip
+    contact_data = pin.StdVec_RigidConstraintData()
+    for constraint in constraints:
+        contact_data.append(constraint.createData())
+    data = model.createData()
+    pin.initConstraintDynamics(model, data, constraints, contact_data)
+    J = mechanism.assembled.J
+    for _ in range(10):
+        v_tree, u_tree = random.uniform(-1, 1, n), random.uniform(-5, 5, n)
+        v_tree -= np.linalg.pinv(J) @ (J @ v_tree)
+        settings = pin.ProximalSettings(1e-14, 1e-10, 100)
+        expected = pin.constraintDynamics(
+            model, data, mechanism.q_tree, v_tree, u_tree, constraints, contact_data, settings)  # fmt: skip
+        computed = core.dae_acceleration(mechanism.q_tree, v_tree, u_tree, np.zeros(len(J)))
+        assert relative_error(computed, expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize("kind", ["talos", "fixed", "free"])
+def test_core_equals_its_projection(kind):
+    mechanism = load("talos") if kind == "talos" else random_tree(5, free=kind == "free")
+    assert mechanism.rank == mechanism.closure.rows  # redundant rows contradict each other off the manifold
+    eliminating, projecting = _core.Core(core_table(mechanism)), _core.Core(core_table(mechanism))
+    assert eliminating.has_elimination
+    projecting.allow_elimination(False)
+    correction = np.linspace(-1, 1, mechanism.closure.rows)
+    errors = []
+    for terms, u_tree in random_states(mechanism, 20, seed=2):
+        state = terms.q_tree, terms.v_tree, u_tree, correction
+        errors.append(relative_error(eliminating.dae_acceleration(*state), projecting.dae_acceleration(*state)))
+    assert np.median(errors) > 0  # zero if a small pivot leads to projection
+    assert np.max(errors) <= TOLERANCE
+
+
+def test_small_mechanisms_and_chains_with_few_freedoms_use_projection():
+    chain = build(*generate(GeneratorSpec(generator="n_four_bar", N=16)))
+    for mechanism in [load(name) for name in shipped() if name != "talos"] + [chain]:
+        assert not _core.Core(core_table(mechanism)).has_elimination, mechanism.name
+
+
+def pendulums(masses, friction=0.0):
+    """Return a chain of thin rods in a plane, each 1 m long; all joints but the first have friction."""
+    elements = [urdf_link("0", 1.0, np.zeros(3), np.eye(3))]
+    for k, mass in enumerate(masses, 1):
+        elements.append(urdf_link(str(k), mass, np.array([0.5, 0.0, 0.0]), mass / 12 * np.diag([1e-6, 1.0, 1.0])))
+        elements.append(urdf_joint(f"j{k}", "revolute", str(k - 1), str(k), (float(k > 1), 0, 0), axis=(0, 0, 1),
+                                   limit=WIDE_LIMIT))  # fmt: skip
+    joints = [{"name": f"j{k}", "friction": friction} for k in range(2, len(masses) + 1)] if friction else []
+    return Mechanism.from_urdf(urdf_robot("pendulums", elements), gravity=(0, -9.81, 0), joints=joints)
+
+
+def test_a_small_pivot_falls_back_to_projection():
+    """A load of 10,000 tonnes hangs on a chain of light rods, whose own inertia is a difference of large numbers."""
+    mechanism = pendulums([1.0] * 19 + [1e7])
+    table = core_table(mechanism)
+    eliminating, projecting, elimination = _core.Core(table), _core.Core(table), _core.SparseElimination(table)
+    projecting.allow_elimination(False)
+    assert eliminating.has_elimination
+    for terms, u_tree in random_states(mechanism, 5, seed=3):
+        assert elimination.acceleration(terms.q_tree, terms.v_tree, u_tree) is None
+        state = terms.q_tree, terms.v_tree, u_tree, np.zeros(0)
+        np.testing.assert_array_equal(eliminating.dae_acceleration(*state), projecting.dae_acceleration(*state))
+
+
+def test_dependent_rows_are_detected():
+    """The squares stand upright, where the loops lose rank."""
+    mechanism = build(*generate(GeneratorSpec(generator="n_four_bar", N=3)))
+    elimination, n = _core.SparseElimination(core_table(mechanism)), mechanism.n
+    flat = mechanism.tree.integrate(mechanism.q_tree, np.where(np.arange(n) <= 3, -np.pi / 2, np.pi / 2))
+    assert elimination.acceleration(mechanism.q_tree, np.zeros(n), np.zeros(n)) is not None
+    assert elimination.acceleration(flat, np.zeros(n), np.zeros(n)) is None
+
+
+def test_rods_with_sticking_joints_move_as_one_rod():
+    rods, t_end = 14, 1.0
+    scene = Scene(
+        pendulums([1.0] * rods, friction=1e6),
+        formulation="dae",
+        t_end=t_end,
+        solver={"rtol": 1e-11, "terms": "pinocchio"},
+    )
+    run = simulate(scene)
+
+    def rate(_, y):
+        return [y[1], -1.5 * 9.81 / rods * np.cos(y[0])]
+
+    expected = solve_ivp(rate, (0, t_end), [0, 0], rtol=1e-12, atol=1e-12, t_eval=run.t).y[0]
+    assert run.status == "done"
+    assert np.abs(run.q_tree[:, 0] - expected).max() <= 1e-9
+    assert np.abs(run.q_tree[:, 1:]).max() <= 1e-12
+
+
+@pytest.mark.parametrize("loops", ["all", 1])
+def test_work_grows_in_proportion_to_the_number_of_squares(loops, tmp_path):
+    work = {}
+    for N in (5, 10, 20, 40):
+        write_case(Case(N, N if loops == "all" else loops), tmp_path)
+        mechanism = load(tmp_path / "mechanism.toml")
+        work[N] = _core.SparseElimination(core_table(mechanism)).operations
+    assert exponent(work, whole=True) <= 1.05
