@@ -130,6 +130,7 @@ class Core {
   void compute_rho();  // eq. 5
   void compute_D_tree();
   void compute_D();  // and factorize it
+  bool is_D_computed() const { return is_valid(inertia_of_q); }
   Vector q_tree;
   Factor phi_z;
   DefiniteFactor D_factor;

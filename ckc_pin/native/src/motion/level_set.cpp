@@ -134,7 +134,9 @@ bool LevelSet::motion_rhs(double t, In y, Out y_dot) {
   // On the manifold eq. 6 equals eq. 1 at rho q_dot.
   const Vector& force = applied_force(v_tree);
   const bool locked = !core.joints.locked.empty();
-  const bool eliminates = on_manifold_ && core.has_elimination() && !locked && !core.has_released_rows();
+  // With D of a controller, eq. 6 costs less than sparse elimination.
+  const bool eliminates = on_manifold_ && (core.compiled || (core.has_elimination() && !core.is_D_computed())) &&
+                          !locked && !core.has_released_rows();
   has_tree_acceleration_ = eliminates && core.eliminate(force, row_correction_, a_tree_);
   if (eliminates && core.compiled && !has_tree_acceleration_) ++counts.general_rhs;
   if (!has_tree_acceleration_ && (locked || core.has_row_motion() || (on_manifold_ && core.uses_mass_levels()))) {
