@@ -378,11 +378,6 @@ bool Core::differentiate(In u_tree, In acceleration) {
 
 bool Core::solve_acceleration_derivatives(const Matrix& force, const Matrix& residual, Matrix& derivatives) {
   derivatives.resize(n, force.cols());
-  if (factorize_sparsely()) {
-    for (Eigen::Index k = 0; k < force.cols(); ++k)
-      sparse_->solve(force.col(k), residual.col(k), derivatives.col(k));
-    return true;
-  }
   for (Eigen::Index k = 0; k < force.cols(); ++k) {
     residual_ = residual.col(k);
     if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
