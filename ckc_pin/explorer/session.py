@@ -16,7 +16,7 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.explorer import saving
 from ckc_pin.explorer.branches import draw_branches, list_branches
 from ckc_pin.explorer.describe import describe_setup
-from ckc_pin.explorer.history import History, Snapshot
+from ckc_pin.explorer.history import PoseHistory, Snapshot
 from ckc_pin.explorer.live_run import LiveRun, list_modes
 from ckc_pin.explorer.map_panel import MapPanel
 from ckc_pin.explorer.messages import (
@@ -102,7 +102,7 @@ class Session:
         self.original = self.mechanism = opened.mechanism
         self.at = opened.start
         self.parameters: dict[str, float] = {}
-        self.history = History(Snapshot(self.at.q_tree, {}))
+        self.history = PoseHistory(Snapshot(self.at.q_tree, {}))
         self.map_panel, self._has_map = MapPanel(lambda image: self._post(lambda: self._report(image))), False
         self._branches: list[Kinematics] = []
         self._goal: Move | Drag | GoTo | None = None
