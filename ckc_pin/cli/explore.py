@@ -32,7 +32,7 @@ __all__ = ["explore"]
 @options.port
 @options.open_browser
 def explore(what: str, overrides: dict[str, Any], out: Path | None, port: int, open_browser: bool) -> None:
-    """Drag a mechanism in the browser, loops closed; change it and run it. Ctrl-C ends."""
+    """Drag a mechanism in the browser. Its loops stay closed. The page can also change it, and run it."""
     import ckc_pin
 
     with ckc_pin.explore(what, overrides, out=out, port=port, open_browser=open_browser) as explorer:
