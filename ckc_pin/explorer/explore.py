@@ -118,7 +118,7 @@ class Explorer:
     def stop(self) -> None:
         """End the server; pages that are open say so."""
         self._stopped.set()
-        self._queue.wake()
+        self._queue.put(lambda: None)  # The thread may be about to wait for a request.
         self._thread.join()
         self._server.stop()
 
