@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import threading
 import urllib.error
 import urllib.request
@@ -67,3 +70,33 @@ def test_newer_positions_of_a_gesture_replace_older_ones():
     expected = [requests[k] for k in (1, 2, 3, 5, 7)]
     assert [queue.take(0.0) for _ in expected] == expected
     assert queue.take(0.0) is None
+
+
+def run_command(*arguments: str) -> tuple[str, int, str]:
+    """Start `ckc explore`, read the first line, visit its address and interrupt it; return line, code and errors."""
+    command = [sys.executable, "-m", "ckc_pin", "explore", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        try:
+            if line:
+                assert urllib.request.urlopen(line.split()[0]).status == 200
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    return line, process.returncode, errors
+
+
+def test_command_prints_its_address_first_and_ends_at_ctrl_c():
+    line, code, errors = run_command("five_bar/tracking", "--set", "t_end=1.0")
+    assert line.startswith("http://127.0.0.1:")
+    assert line.endswith("(Ctrl-C ends)\n")
+    assert (code, errors) == (0, "")
+
+
+def test_command_refuses_wrong_input_in_one_line():
+    _, code, errors = run_command("five_baar")
+    assert code == 2
+    assert errors.count("\n") == 1
+    assert "five_bar" in errors
