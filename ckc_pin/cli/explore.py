@@ -36,8 +36,8 @@ def explore(what: str, overrides: dict[str, Any], out: Path | None, port: int, o
     import ckc_pin
 
     with ckc_pin.explore(what, overrides, out=out, port=port, open_browser=open_browser) as explorer:
-        print(f"{explorer.url}  (Ctrl-C ends)", flush=True)
         try:
+            print(f"{explorer.url}  (Ctrl-C ends)", flush=True)
             explorer.wait()
         except KeyboardInterrupt as stop:
             acknowledge(stop)

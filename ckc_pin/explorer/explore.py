@@ -159,7 +159,8 @@ class Explorer:
             while request is not None:
                 _execute(session, request)
                 has_changed = True
-                request = self._queue.take(0.0)
+                # Requests may come faster than they are handled; frames are sent all the same.
+                request = self._queue.take(0.0) if perf_counter() < next_frame else None
             if (session.is_active or has_changed) and perf_counter() >= next_frame:
                 next_frame, has_changed = perf_counter() + FRAME_S, False
                 session.advance()

@@ -303,9 +303,9 @@ class Session:
         self._end_gesture()
 
     def _complete_movement(self) -> None:
-        """Bring the present movement to its end, so that the next request finds its result."""
+        """Bring a slider's movement to its end, so that the next request finds its result. A drag ends where it is."""
         for _ in range(MAX_FRAMES_OF_MOVEMENT):
-            if self._goal is None:
+            if self._goal is None or isinstance(self._goal, Drag):
                 break
             self._move(self._goal)
         self._goal = None

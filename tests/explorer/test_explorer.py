@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 
@@ -15,6 +16,7 @@ import ckc_pin
 from ckc_pin import InputError
 from ckc_pin.explorer.messages import Drag, GoTo, Move, Release
 from ckc_pin.explorer.request_queue import RequestQueue
+from ckc_pin.explorer.session import Session
 
 
 def test_explorer_stops_at_once_however_early_it_is_stopped():
@@ -100,3 +102,21 @@ def test_command_refuses_wrong_input_in_one_line():
     assert code == 2
     assert errors.count("\n") == 1
     assert "five_bar" in errors
+
+
+def test_frames_are_sent_while_requests_come_faster_than_they_are_handled(monkeypatch):
+    """Each request takes longer than the next one needs to arrive."""
+    frames: list[float] = []
+    monkeypatch.setattr(Session, "handle", lambda self, request: time.sleep(0.01))
+    send_frame = Session.send_frame
+
+    def record(self: Session) -> None:
+        frames.append(time.monotonic())
+        send_frame(self)
+
+    monkeypatch.setattr(Session, "send_frame", record)
+    with ckc_pin.explore("five_bar") as explorer:
+        for _ in range(150):
+            explorer._queue.put(Release())
+            time.sleep(0.005)
+    assert len(frames) > 10
