@@ -13,15 +13,22 @@ import pytest
 from scripts.experiments.benchmark.peers import compiled
 from scripts.experiments.benchmark.peers.pinocchio_loop import PinocchioLoop
 from scripts.experiments.benchmark.work import WORKS, Work
+from tests.analytic.five_bar import FIVE_BAR
 
 LOOP, LCABA = PinocchioLoop("constraintDynamics"), PinocchioLoop("lcaba")
 compiles = pytest.mark.skipif(not compiled.compiler(), reason="no C++ compiler: that it is said is tested below")
 ONE_SQUARE = Work("one_square", "N-four-bar, N = 1, 0.5 s", "n_four_bar", 0.5, {"mechanism.N": 1}, point="B0")
+THREE_SECONDS = Work("swing", "five-bar, free swing, 3 s", "five_bar/swing", 3.0)
 TIGHT = "K_p 0, mu 1e-08, iterations 3, tolerance 1e-12"
 TIGHT_LCABA = "K_p 0, mu 0.001, iterations 5, tolerance 1e-12"
 both = pytest.mark.parametrize(
     ("loop", "tight"), [(LOOP, TIGHT), (LCABA, TIGHT_LCABA)], ids=["constraintDynamics", "lcaba"]
 )
+
+
+def _phi(q_tree: np.ndarray) -> np.ndarray:
+    """Return phi of the five-bar by NumPy, by instant."""
+    return np.array([FIVE_BAR.phi(row) for row in q_tree])
 
 
 @pytest.fixture
@@ -68,6 +75,18 @@ def test_loop_program_follows_closed_form(loop: PinocchioLoop, tight: str) -> No
     assert motion.rhs is not None
     assert motion.rhs >= 13 * motion.steps
     assert 0 < motion.wall_s < 60.0
+
+
+@compiles
+@both
+def test_baumgarte_terms_keep_loops_closed(loop: PinocchioLoop, tight: str) -> None:
+    """lcaba of Pinocchio 4.1 does not compute the errors of point constraints: the loop has to."""
+    proximal = tight.removeprefix("K_p 0, ").rpartition(",")[0]
+    free, pulled = (
+        np.abs(_phi(loop.compute(THREE_SECONDS, f"K_p {gain}, {proximal}, tolerance 1e-05", 60.0).q_tree))
+        for gain in (0, 100)
+    )
+    assert 3 * pulled.max() < free.max() < 1e-2
 
 
 @compiles

@@ -2,6 +2,7 @@
 // 7(8) with its own step control. Reads one problem from standard input, writes the motion at its instants and its cost.
 #include <pinocchio/algorithm/energy.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
 #include <pinocchio/algorithm/loop-constrained-aba.hpp>
 #include <pinocchio/algorithm/proximal.hpp>
 #include <pinocchio/constraints.hpp>
@@ -159,6 +160,7 @@ struct Problem {
     tau = constant - damping.cwiseProduct(v);
     if (model.nq == model.nv) tau -= stiffness.cwiseProduct(q - rest);
     if (!springs.empty()) pull();
+    if (by_lcaba && constraints.size() && constraints[0].m_baumgarte_parameters.Kp > 0) update_errors_of_points();
     if (by_lcaba) return pin::lcaba(model, data, q, v, tau, constraints, constraint_data, proximal);
     return pin::constraintDynamics(model, data, q, v, tau, constraints, constraint_data, proximal);
   }
@@ -183,6 +185,21 @@ struct Problem {
       const Eigen::Quaterniond twice = turned * Eigen::Quaterniond(0, w.x(), w.y(), w.z());
       for (int k : {0, 1, 2}) rate[at + k] = p_dot[k];
       for (int k : {0, 1, 2, 3}) rate[at + 3 + k] = 0.5 * twice.coeffs()[k];
+    }
+  }
+
+  // lcaba of Pinocchio 4.1 reads the errors of point constraints for its Baumgarte terms, but does not compute them.
+  void update_errors_of_points() {
+    pin::forwardKinematics(model, data, q, v);
+    for (std::size_t k = 0; k < constraints.size(); ++k) {
+      const auto& constraint = constraints[k];
+      if (constraint.type != pin::CONTACT_3D) continue;
+      const auto a = constraint.joint1_id, b = constraint.joint2_id;
+      const pin::SE3 on_a = constraint.joint1_placement, on_b = constraint.joint2_placement;
+      const pin::SE3 b_in_a = (data.oMi[a] * on_a).actInv(data.oMi[b] * on_b);
+      constraint_data[k].contact_placement_error.linear() = -b_in_a.translation();
+      constraint_data[k].contact_velocity_error.linear() =
+          on_a.actInv(data.v[a]).linear() - b_in_a.rotation() * on_b.actInv(data.v[b]).linear();
     }
   }
 
