@@ -1,4 +1,4 @@
-"""Compile the C++ program next to this file at its first use, and keep it in the benchmark's cache."""
+"""Compile C++ programs at their first use, and keep them in the benchmark's cache."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import hashlib
 import os
 import shutil
 import subprocess
+from collections.abc import Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-__all__ = ["compiler", "program", "version"]
+__all__ = ["compile_program", "compiler", "program", "version"]
 
 SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
 PROGRAMS = Path(__file__).resolve().parents[4] / ".cache" / "benchmark" / "programs"
@@ -21,23 +22,38 @@ FLAGS = [
     *("-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"),
     *("-DBOOST_FUSION_INVOKE_MAX_ARITY=12", "-DPINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION"),
 ]
-PATIENCE = 900.0  # s; lcaba is compiled here for all types of joints, two minutes of processor time
+PATIENCE = 1800.0  # s; lcaba is compiled here for all types of joints, two minutes of processor time
 
 
 @cache
 def program() -> tuple[Path, str | None]:
-    """Return the path of the program, and why it is missing: no compiler, no headers, or the compiler's error."""
+    """Return the path of the loop on Pinocchio next to this file, and why it is missing."""
+    return compile_program([SOURCE], FLAGS, ["pinocchio_default"])
+
+
+def compile_program(
+    sources: Sequence[Path], flags: Sequence[str] = (), libraries: Sequence[str] = ()
+) -> tuple[Path, str | None]:
+    """Return the path of a program, and why it is missing: no compiler, no headers, or the compiler's error.
+
+    Parameters
+    ----------
+    sources : sequence of Path
+        The file to compile, then its own headers.
+    flags, libraries : sequence of str
+        Beside the folders of the headers of Eigen, Boost and Pinocchio.
+    """
     prefix, executable = _prefix(), compiler()
     if executable is None:
         return PROGRAMS, "no C++ compiler was found"
     if prefix is None or not (prefix / "include" / "eigen3").is_dir():
         return PROGRAMS, "Eigen's headers are missing: pip install cmeel-eigen"
     include = ["-isystem", str(prefix / "include"), "-isystem", str(prefix / "include" / "eigen3")]
-    library = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default"]
-    command = [executable, *FLAGS, *include, str(SOURCE), *library]
+    link = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", *(f"-l{name}" for name in libraries)]
+    command = [executable, *flags, *include, str(sources[0]), *link]
     versions = [metadata.version(name) for name in ("libpinocchio", "cmeel-boost", "cmeel-eigen")]
-    key = hashlib.sha256(" ".join([*command, *versions, SOURCE.read_text()]).encode()).hexdigest()[:16]
-    path = PROGRAMS / f"loop_{key}"
+    content = " ".join([*command, *versions, *(source.read_text(encoding="utf-8") for source in sources)])
+    path = PROGRAMS / f"{sources[0].stem}_{hashlib.sha256(content.encode()).hexdigest()[:16]}"
     return path, None if path.exists() else _compile(command, path)
 
 
