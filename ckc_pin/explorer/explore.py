@@ -143,7 +143,7 @@ class Explorer:
         try:
             with one_blas_thread():
                 self._work()
-        except Exception as error:  # a defect: pages are told, and `wait` raises it
+        except Exception as error:  # A defect: the pages show it, and `wait` raises it.
             traceback.print_exc()
             self._session.notify(f"the explorer has ended: {error!r}; start it again", is_error=True)
             self._error = error
@@ -169,7 +169,7 @@ class Explorer:
 
 def _execute(session: Session, request: Any) -> None:
     """Handle a request of a page, or call a function that another thread has posted."""
-    if isinstance(request, Callable):  # type: ignore[arg-type]
+    if callable(request):
         request()
     else:
         session.handle(request)

@@ -156,9 +156,9 @@ class Session:
         opened = self.opened.with_open_loops
         at = self.at if opened is None else opened.kinematics(self.at.q_tree)
         shown = self.quantities.evaluate(at, *self._motion())
-        values = self.mechanism.tree.to_coordinates(self.at.q_tree).tolist()
+        tree = self.mechanism.tree
         report = PoseReport(
-            values=dict(zip(self.mechanism.coordinates, values, strict=True)),
+            values=tree.named(tree.to_coordinates(self.at.q_tree)),
             closure=float(np.abs(at.phi).max(initial=0.0)),
             end=self._end,
             ended=self._ended,
@@ -390,7 +390,7 @@ class Session:
     def _replace_mechanism(self, mechanism: Mechanism, at: Kinematics, parameters: dict[str, float]) -> None:
         """Continue with the mechanism of other parameter values at a pose; draw and describe it."""
         self.mechanism, self.at, self.parameters = mechanism, at, parameters
-        shown = [info.name for info in self.quantities.infos() if info.on]
+        shown = self.quantities.visible_names
         self.quantities.close()
         self._send(commands.delete(SHOWN))
         self._draw_bodies()  # before the quantities, some of which draw on the bodies
