@@ -32,12 +32,12 @@ __all__ = ["explore"]
 @options.port
 @options.open_browser
 def explore(what: str, overrides: dict[str, Any], out: Path | None, port: int, open_browser: bool) -> None:
-    """Take hold of a mechanism in the browser: drag it with its loops closed, change it, run it. Ctrl-C ends."""
+    """Drag a mechanism in the browser. Its loops stay closed. The page can also change it, and run it."""
     import ckc_pin
 
     with ckc_pin.explore(what, overrides, out=out, port=port, open_browser=open_browser) as explorer:
-        print(f"{explorer.url}  (Ctrl-C ends)", flush=True)
         try:
+            print(f"{explorer.url}  (Ctrl-C ends)", flush=True)
             explorer.wait()
         except KeyboardInterrupt as stop:
             acknowledge(stop)

@@ -118,7 +118,7 @@ class Explorer:
     def stop(self) -> None:
         """End the server; pages that are open say so."""
         self._stopped.set()
-        self._queue.wake()
+        self._queue.put(lambda: None)  # The thread may be about to wait for a request.
         self._thread.join()
         self._server.stop()
 
@@ -143,7 +143,7 @@ class Explorer:
         try:
             with one_blas_thread():
                 self._work()
-        except Exception as error:  # a defect: pages are told, and `wait` raises it
+        except Exception as error:  # A defect: the pages show it, and `wait` raises it.
             traceback.print_exc()
             self._session.notify(f"the explorer has ended: {error!r}; start it again", is_error=True)
             self._error = error
@@ -159,7 +159,8 @@ class Explorer:
             while request is not None:
                 _execute(session, request)
                 has_changed = True
-                request = self._queue.take(0.0)
+                # Requests may come faster than they are handled; frames are sent all the same.
+                request = self._queue.take(0.0) if perf_counter() < next_frame else None
             if (session.is_active or has_changed) and perf_counter() >= next_frame:
                 next_frame, has_changed = perf_counter() + FRAME_S, False
                 session.advance()
@@ -168,7 +169,7 @@ class Explorer:
 
 def _execute(session: Session, request: Any) -> None:
     """Handle a request of a page, or call a function that another thread has posted."""
-    if isinstance(request, Callable):  # type: ignore[arg-type]
+    if callable(request):
         request()
     else:
         session.handle(request)

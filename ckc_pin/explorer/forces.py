@@ -1,4 +1,4 @@
-"""StaticForces torques of a pose, and the forces of its loops and joints."""
+"""Motor torques that hold a pose, and the forces of its loops and joints."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class HoldingTorques(LiveQuantity):
         return "" if mechanism.d else "the mechanism has no freedoms"
 
     def evaluate(self, state: PoseState, shown: ShownQuantities) -> list[list[str]]:
-        """Return h by coordinate, tau by motor, and what remains if the motors cannot hold the pose."""
+        """Return h by coordinate, tau by motor, and the missing part of h if the motors cannot hold the pose."""
         mechanism, static = self.mechanism, state.static_forces
         names = mechanism.independent
         units = [effort(mechanism.tree.units()[k]) for k in mechanism.partition.q]

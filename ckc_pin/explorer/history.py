@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 
-__all__ = ["History", "Snapshot"]
+__all__ = ["PoseHistory", "Snapshot"]
 
 MAX_SNAPSHOTS = 1000
 
@@ -26,7 +26,7 @@ class Snapshot:
         return np.array_equal(self.q_tree, other.q_tree) and dict(self.parameters) == dict(other.parameters)
 
 
-class History:
+class PoseHistory:
     """Snapshots in the order of the gestures, and the place of the present one."""
 
     def __init__(self, first: Snapshot) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import describe_value, is_number
+from ckc_pin.control.actuation import Actuation
 from ckc_pin.control.controllers import has_state
 from ckc_pin.control.forces import Force, as_vector
 from ckc_pin.control.joint_servo import JointServo
@@ -137,7 +138,7 @@ def _explain_no_hold(mechanism: Mechanism, scene: Scene | None) -> str:
     if not mechanism.actuated or not mechanism.d:
         return f"{mechanism.name} has no motors" if mechanism.d else f"{mechanism.name} has no freedoms"
     try:
-        actuation = build_scene_actuation(scene or Scene(mechanism, t_end=1.0), mechanism)
+        actuation = Actuation(mechanism) if scene is None else build_scene_actuation(scene, mechanism)
         return actuation.explain_undriven_freedoms(mechanism.assembled)
     except CkcError as error:
         return str(error)

@@ -10,7 +10,7 @@ import msgspec
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import require_type
-from ckc_pin.errors import MechanismError
+from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.assembly import assemble_mechanism, open_loops
 from ckc_pin.kinematics.loading import load, read_spec
 from ckc_pin.mechanism.configuration import Kinematics
@@ -72,6 +72,8 @@ def open_explored(what: Any, overrides: dict[str, Any] | None = None) -> Opened:
     """
     require_type(what, (Mechanism, Scene, str, Path), "explore: what", EXPECTED)
     if isinstance(what, Mechanism):
+        if overrides:
+            raise InputError("explore: overrides: expected none with a Mechanism; give its name or path instead")
         return Opened(what.name, what, what.assembled)
     if isinstance(what, Scene) or is_scene_name(str(what)):
         scene = what.with_overrides(overrides) if isinstance(what, Scene) else load_scene(what, overrides)

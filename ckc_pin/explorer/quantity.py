@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -113,7 +114,7 @@ class PoseState:
 
     @lazy
     def is_singular(self) -> bool:
-        """Whether phi_z is singular to working precision, so that rho, h and what depends on them do not exist."""
+        """Whether phi_z is singular to working precision, so that rho and h do not exist."""
         return self.at.margin() <= SINGULAR_MARGIN
 
     @lazy
@@ -156,7 +157,7 @@ class PoseState:
         }
 
 
-class LiveQuantity:
+class LiveQuantity(ABC):
     """A quantity that can be shown: lines of text, bars, and a drawing.
 
     Parameters
@@ -188,9 +189,9 @@ class LiveQuantity:
         """Return the commands that remove its drawing, and forget its past."""
         return [commands.delete(self.root)]
 
+    @abstractmethod
     def evaluate(self, state: PoseState, shown: ShownQuantities) -> list[list[str]]:
         """Return its lines [label, value] at a pose; add bars and commands to `shown`."""
-        raise NotImplementedError
 
-    def close(self) -> None:
-        """End its threads."""
+    def close(self) -> None:  # noqa: B027
+        """End its threads. Most quantities have none."""

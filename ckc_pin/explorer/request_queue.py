@@ -40,11 +40,6 @@ class RequestQueue:
                 self._changed.wait(timeout)
             return self._requests.popleft() if self._requests else None
 
-    def wake(self) -> None:
-        """Let a `take` that waits return."""
-        with self._changed:
-            self._changed.notify()
-
 
 def _replaces(new: object, old: object) -> bool:
     if type(new) is not type(old) or not isinstance(new, Positions):

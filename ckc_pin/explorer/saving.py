@@ -33,8 +33,7 @@ LINE_WIDTH, RING_RADIUS = 0.008, 0.011  # of the mechanism's size
 
 def _by_coordinate(mechanism: Mechanism, at: Kinematics) -> dict[str, float]:
     """Return all coordinates by name, rad or m."""
-    values = mechanism.tree.to_coordinates(at.q_tree).tolist()
-    return dict(zip(mechanism.coordinates, values, strict=True))
+    return mechanism.tree.named(mechanism.tree.to_coordinates(at.q_tree))
 
 
 def q_guess_text(mechanism: Mechanism, at: Kinematics) -> str:

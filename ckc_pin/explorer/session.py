@@ -16,7 +16,7 @@ from ckc_pin.errors import CkcError, InputError
 from ckc_pin.explorer import saving
 from ckc_pin.explorer.branches import draw_branches, list_branches
 from ckc_pin.explorer.describe import describe_setup
-from ckc_pin.explorer.history import History, Snapshot
+from ckc_pin.explorer.history import PoseHistory, Snapshot
 from ckc_pin.explorer.live_run import LiveRun, list_modes
 from ckc_pin.explorer.map_panel import MapPanel
 from ckc_pin.explorer.messages import (
@@ -102,7 +102,7 @@ class Session:
         self.original = self.mechanism = opened.mechanism
         self.at = opened.start
         self.parameters: dict[str, float] = {}
-        self.history = History(Snapshot(self.at.q_tree, {}))
+        self.history = PoseHistory(Snapshot(self.at.q_tree, {}))
         self.map_panel, self._has_map = MapPanel(lambda image: self._post(lambda: self._report(image))), False
         self._branches: list[Kinematics] = []
         self._goal: Move | Drag | GoTo | None = None
@@ -156,9 +156,9 @@ class Session:
         opened = self.opened.with_open_loops
         at = self.at if opened is None else opened.kinematics(self.at.q_tree)
         shown = self.quantities.evaluate(at, *self._motion())
-        values = self.mechanism.tree.to_coordinates(self.at.q_tree).tolist()
+        tree = self.mechanism.tree
         report = PoseReport(
-            values=dict(zip(self.mechanism.coordinates, values, strict=True)),
+            values=tree.named(tree.to_coordinates(self.at.q_tree)),
             closure=float(np.abs(at.phi).max(initial=0.0)),
             end=self._end,
             ended=self._ended,
@@ -303,9 +303,9 @@ class Session:
         self._end_gesture()
 
     def _complete_movement(self) -> None:
-        """Bring the present movement to its end, so that the next request finds its result."""
+        """Bring a slider's movement to its end, so that the next request finds its result. A drag ends where it is."""
         for _ in range(MAX_FRAMES_OF_MOVEMENT):
-            if self._goal is None:
+            if self._goal is None or isinstance(self._goal, Drag):
                 break
             self._move(self._goal)
         self._goal = None
@@ -390,7 +390,7 @@ class Session:
     def _replace_mechanism(self, mechanism: Mechanism, at: Kinematics, parameters: dict[str, float]) -> None:
         """Continue with the mechanism of other parameter values at a pose; draw and describe it."""
         self.mechanism, self.at, self.parameters = mechanism, at, parameters
-        shown = [info.name for info in self.quantities.infos() if info.on]
+        shown = self.quantities.visible_names
         self.quantities.close()
         self._send(commands.delete(SHOWN))
         self._draw_bodies()  # before the quantities, some of which draw on the bodies

@@ -89,10 +89,9 @@ def open_loops(spec: MechanismSpec, sources: Sources, q_tree: Mapping[str, float
     spec = msgspec.structs.replace(spec, independent=None, q_guess=dict(q_tree))
     as_tree = assemble_mechanism(msgspec.structs.replace(spec, loop=[], coupling=[]), sources)
     linkage = Linkage(spec, sources, None)
-    residuals = linkage.closure.largest_residuals(linkage.closure.phi(Pose(linkage.tree, linkage.closure.anchors,
-                                                                           as_tree.q_tree)))  # fmt: skip
+    at = Kinematics(linkage.tree, linkage.closure, as_tree.partition, as_tree.q_tree)
     with one_blas_thread():
-        opened = _create_mechanism(linkage, Assembly(as_tree.q_tree, max(residuals.values(), default=0.0), residuals))
+        opened = _create_mechanism(linkage, _measure(linkage, at))
     return as_tree, opened
 
 
@@ -137,10 +136,8 @@ def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tu
 
 def _close_on_branch(linkage: Linkage, at: Kinematics, tolerance: float) -> Assembly:
     """Close the loops of a linkage near a closed configuration of another one, on its branch (MechanismError)."""
-    start, rounded = (
-        Kinematics(linkage.tree, linkage.closure, at.partition, at.q_tree),
-        ROUNDED_TOLERANCE * linkage.size,
-    )
+    start = Kinematics(linkage.tree, linkage.closure, at.partition, at.q_tree)
+    rounded = ROUNDED_TOLERANCE * linkage.size
     moved = follow_sigma(start, np.zeros(len(at.partition.q)), 0.0, tolerance, anywhere=False)
     closed = _measure(linkage, moved.at)
     if moved.verdict != "converged" or closed.residual > rounded:

@@ -204,7 +204,7 @@ def _follow_q(
             return Movement(at, True)
         step = np.asarray(at.rho @ dq)
         longest = float(tree.step_size(step))
-        at, done, end = _take_step(mechanism, at, step * min(1.0, MAX_STEP / longest), MIN_PIECE, SINGULAR_MARGIN)
+        at, done, end = _take_step(mechanism, at, step * min(1.0, MAX_STEP / longest), SINGULAR_MARGIN, to_its_end=True)
         if done < 1.0:
             return Movement(at, False, end)
     return Movement(at, False)
@@ -241,13 +241,16 @@ def _approach(
             return Movement(at, False, "the loops leave no freedom (d = 0)")
         step, blocked = _damped_step(mechanism, at, jacobian(at), miss)
         trial, closer, end = _search_line(mechanism, at, step, offset, miss, min_margin)
-        if end == SINGULAR and trial is at:  # slide along the singular configurations
+        slides = end == SINGULAR and trial is at
+        if slides:  # along the singular configurations
             step, blocked = _damped_step(mechanism, at, jacobian(at), miss, 2.0 * min_margin)
             trial, closer, _ = _search_line(mechanism, at, step, offset, miss, min_margin)
         progress = _relative_progress(miss, closer)
         at, miss = trial, closer
         if progress < MIN_PROGRESS and np.linalg.norm(miss) > tolerance:
             return Movement(at, False, end or blocked or turning_point)
+        if slides:  # Such a step takes as long as the others together.
+            break
     return Movement(at, bool(np.linalg.norm(miss) <= tolerance))
 
 
@@ -268,7 +271,7 @@ def _search_line(
     step = step * min(1.0, MAX_STEP / longest) if longest > 0.0 else step
     step = step * _fraction_to_stops(mechanism, at, step)
     for _ in range(MAX_SHORTENINGS if longest > 0.0 else 0):
-        trial, done, end = _take_step(mechanism, at, step, MIN_DRAG_PIECE, min_margin)
+        trial, done, end = _take_step(mechanism, at, step, min_margin, to_its_end=False)
         closer = offset(trial)
         if np.linalg.norm(closer) < np.linalg.norm(miss) or (done < 1.0 and trial is at):
             return trial, closer, end
@@ -359,9 +362,18 @@ def _margin_slopes(at: Kinematics, basis: Array) -> Array:
 
 
 def _take_step(
-    mechanism: Mechanism, at: Kinematics, step: Array, min_piece: float, min_margin: float
+    mechanism: Mechanism, at: Kinematics, step: Array, min_margin: float, *, to_its_end: bool
 ) -> tuple[Kinematics, float, str]:
-    """Follow a tangent step; return the last configuration, the fraction that was followed, and why it ended."""
+    """Follow a tangent step; return the last configuration, the fraction that was followed, and why it ended.
+
+    Parameters
+    ----------
+    min_margin : float
+        Of `Kinematics.margin`: how near to singular phi_z may come.
+    to_its_end : bool
+        Follow the step up to where it cannot be followed any further. Otherwise the longest of its halves, quarters and
+        so on that can be followed at once is taken, which costs a tenth and is enough if other steps follow.
+    """
     dq, joints, tree = step[mechanism.partition.q], mechanism.joints, mechanism.tree
     start = tree.to_coordinates(at.q_tree)
     lower, upper = np.minimum(joints.lower, start), np.maximum(joints.upper, start)
@@ -385,7 +397,13 @@ def _take_step(
             return None
         return trial.at
 
-    reached, done = follow(at, advance, min_piece)
+    if to_its_end:
+        reached, done = follow(at, advance, MIN_PIECE)
+    else:
+        reached, done, part = at, 0.0, 1.0
+        while done == 0.0 and part >= MIN_DRAG_PIECE:
+            trial = advance(at, 0.0, part)
+            reached, done, part = (at, 0.0, 0.5 * part) if trial is None else (trial, part, part)
     if done < 1.0 and end == SINGULAR and reached.margin() > NEARLY_SINGULAR_MARGIN:
         end = "the loops cannot be kept closed any further"
     return reached, done, end if done < 1.0 else ""

@@ -156,20 +156,48 @@ def generated_sizes(
     generated_sizes.main(mechanisms or ())
 
 
-@app.command(epilog=examples("benchmark --quick --out out/report", "benchmark --page"))
+@app.command(
+    epilog=examples("benchmark --quick --out out/report", "benchmark --page", 'benchmark --peer "python my_peer.py"')
+)
 def benchmark(
     quick: Annotated[bool, typer.Option("--quick", help="fewer motions, methods and tolerances: minutes")] = False,
-    out: Annotated[Path, typer.Option(metavar="DIR")] = DOCS / "report",
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="default: docs/report, and with --peer out/report")
+    ] = None,
     page: Annotated[bool, typer.Option("--page", help="measure nothing: page and figures from the tables")] = False,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(metavar="COMMAND", help="a program to add, as docs/report/peers.md explains; repeatable"),
+    ] = None,
 ) -> None:
     """Measure error against run time, here and in other programs.
 
     Writes docs/report. An interrupted benchmark resumes where it stopped.
     """
     from scripts.experiments.benchmark import make
+    from scripts.experiments.benchmark.peers.protocol import add_programs
 
-    for path in make.report(out, quick=quick, from_tables=page):
+    if page and peer:
+        raise typer.BadParameter("--page measures nothing, so it adds no --peer; leave one of them out")
+    folder = out or (Path("out/report") if peer else DOCS / "report")
+    for path in make.report(folder, quick=quick, from_tables=page, added=add_programs(peer or ())):
         print(f"written: {path}")
+
+
+@app.command("peer", epilog=examples('peer "python my_peer.py"', "peer ./my_peer swing bricard"))
+def peer_(
+    command: Annotated[str, typer.Argument(metavar="COMMAND", help="as docs/report/peers.md explains")],
+    works: Annotated[list[str] | None, typer.Argument(metavar="WORK", show_default=False)] = None,
+) -> None:
+    """Run works of the benchmark in another program and in ckc_pin.
+
+    Prints errors and times. Exits with 1 if a run failed.
+    """
+    from scripts.experiments.benchmark.peer_table import print_table
+    from scripts.experiments.benchmark.work import WORKS
+
+    keys = check_names(works, [work.key for work in WORKS], "work")
+    raise typer.Exit(0 if print_table(command, keys) else 1)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})

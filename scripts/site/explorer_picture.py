@@ -1,4 +1,4 @@
-"""The moving picture of the explorer: python -m scripts.site.explorer_picture writes docs/images/explore.gif.
+"""Pictures of the explorer: python -m scripts.site.explorer_picture writes them into docs/images.
 
 A Chromium without a window shows the page while the mouse of Playwright drags the five-bar, switches its branch, lets
 it go and pushes it.
@@ -12,12 +12,14 @@ import shutil
 from pathlib import Path
 
 from PIL import Image, ImageDraw
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page, Playwright, sync_playwright
 
 import ckc_pin
+from scripts.experiments.chart import shrink
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 SIZE = (920, 540)  # of the window, pixels
+SCREENS = {"wide": (1100, 640), "narrow": (400, 700)}
 SCALE = 0.75  # of the picture
 FRAME_MS = 80
 COLOURS = 80
@@ -126,17 +128,45 @@ def film_five_bar(page: Page) -> Film:
     return film
 
 
-def main() -> None:
-    """Write the moving picture."""
-    with ckc_pin.explore("five_bar") as explorer, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
-        page.goto(explorer.url)
+def open_page(playwright: Playwright, url: str, size: tuple[int, int]) -> Page:
+    """Open the explorer's page in a window of a size."""
+    browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=ARGUMENTS)
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.goto(url)
+    page.wait_for_timeout(STARTING_MS)
+    return page
+
+
+def photograph_delta(playwright: Playwright, url: str) -> None:
+    """Write a picture of the delta with some quantities in a wide window, and one of a narrow window."""
+    for name, size in SCREENS.items():
+        page = open_page(playwright, url, size)
+        for quantity in ("forces", "ellipsoids", "traces"):
+            page.locator(f"#quantities [data-name={quantity}] input").check()
+        x, y = page.evaluate(POINT, ["plate_place", [0.0, 0.0, 0.0]])
+        page.mouse.move(x, y)
+        page.mouse.down()
+        for step in range(1, 13):
+            page.mouse.move(x + 4 * step, y - 2 * step)
+            page.wait_for_timeout(FRAME_MS)
+        page.mouse.up()
         page.wait_for_timeout(STARTING_MS)
+        page.screenshot(path=IMAGES / "guide" / f"explore_{name}.png")
+        shrink(IMAGES / "guide" / f"explore_{name}.png")
+        for quantity in ("forces", "ellipsoids", "traces"):
+            page.locator(f"#quantities [data-name={quantity}] input").uncheck()
+        page.keyboard.press("h")
+
+
+def main() -> None:
+    """Write the pictures."""
+    with ckc_pin.explore("five_bar") as explorer, sync_playwright() as playwright:
+        page = open_page(playwright, explorer.url, SIZE)
         page.evaluate("viewer.hide_background()")  # Its gradient would take most colours of the palette.
         film_five_bar(page).save(IMAGES / "explore.gif")
-        browser.close()
-    print(f"written: {IMAGES / 'explore.gif'}")
+    with ckc_pin.explore("delta") as explorer, sync_playwright() as playwright:
+        photograph_delta(playwright, explorer.url)
+    print(f"written: {IMAGES / 'explore.gif'} and two pictures in {IMAGES / 'guide'}")
 
 
 if __name__ == "__main__":

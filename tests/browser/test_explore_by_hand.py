@@ -36,7 +36,7 @@ BODY_POSITIONS = """(paths) => {
 }"""
 
 
-class Watched:
+class RecordedExplorer:
     """An explorer whose frames are recorded."""
 
     def __init__(self, explorer: ckc_pin.Explorer, frames: list[tuple[float, float, float]]) -> None:
@@ -56,7 +56,7 @@ class Watched:
 
 
 @pytest.fixture
-def explore(monkeypatch) -> Iterator[Callable[..., Watched]]:
+def explore(monkeypatch) -> Iterator[Callable[..., RecordedExplorer]]:
     """Start explorers that record time, closure and branch of each frame, and stop them at the end."""
     started: list[ckc_pin.Explorer] = []
     frames: list[tuple[float, float, float]] = []
@@ -70,10 +70,10 @@ def explore(monkeypatch) -> Iterator[Callable[..., Watched]]:
 
     monkeypatch.setattr(Session, "send_frame", record)
 
-    def start(what: Any, **options: Any) -> Watched:
+    def start(what: Any, **options: Any) -> RecordedExplorer:
         explorer = ckc_pin.explore(what, **options)
         started.append(explorer)
-        return Watched(explorer, frames)
+        return RecordedExplorer(explorer, frames)
 
     yield start
     for explorer in started:
@@ -95,39 +95,39 @@ def test_random_drags_stay_closed_on_their_branch(name, explore, look_at):
     """Closure is checked in each frame, and frames keep coming while the mouse moves."""
     if name.endswith(".xml"):
         with pytest.warns(ckc_pin.errors.ImportNote):
-            watched = explore(IMPORTED / name)
+            recorded = explore(IMPORTED / name)
     else:
-        watched = explore(name)
-    visit = look_at(watched.explorer.url, READY)
-    start = watched.values
+        recorded = explore(name)
+    visit = look_at(recorded.explorer.url, READY)
+    start = recorded.values
     random = np.random.default_rng(7)
-    places = visit.page.evaluate(BODY_POSITIONS, watched.paths)
+    places = visit.page.evaluate(BODY_POSITIONS, recorded.paths)
     assert places
     for _ in range(3):
         x, y = places[int(random.integers(len(places)))]
         steps = random.uniform(-40, 40, (PATH_POINTS, 2))
         drag_along(visit, (x, y), np.array([x, y]) + np.cumsum(steps, axis=0))
     visit.until("!document.getElementById('undo').disabled")
-    assert watched.values != start
-    frames = np.array(watched.frames)
+    assert recorded.values != start
+    frames = np.array(recorded.frames)
     assert frames[:, 1].max() <= MAX_CLOSURE
     assert len(set(frames[:, 2])) == 1
     assert len(frames) > PATH_POINTS
 
 
 def test_slider_at_its_end_says_why(explore, look_at):
-    watched = explore("five_bar")
-    visit = look_at(watched.explorer.url, READY)
+    recorded = explore("five_bar")
+    visit = look_at(recorded.explorer.url, READY)
     number = visit.page.locator("#coordinates input.number").first
     number.fill("3")
     number.press("Enter")
     visit.until("document.body.innerText.includes('phi_z is singular there')")
-    assert watched.session.at.margin() < 1e-3
+    assert recorded.session.at.margin() < 1e-3
 
 
 def test_run_of_the_page_equals_the_command_to_the_bit(explore, look_at, tmp_path):
-    watched = explore("five_bar/swing", out=tmp_path)
-    visit = look_at(watched.explorer.url, READY)
+    recorded = explore("five_bar/swing", out=tmp_path)
+    visit = look_at(recorded.explorer.url, READY)
     visit.page.locator("#run-section summary").click()
     visit.page.locator("#start").click()
     visit.until("parseFloat(document.getElementById('time-slider').max) > 0.3")
@@ -142,8 +142,8 @@ def test_run_of_the_page_equals_the_command_to_the_bit(explore, look_at, tmp_pat
 
 
 def test_two_pages_show_one_pose(explore, look_at):
-    watched = explore("five_bar")
-    first, second = (look_at(watched.explorer.url, READY) for _ in range(2))
+    recorded = explore("five_bar")
+    first, second = (look_at(recorded.explorer.url, READY) for _ in range(2))
     number = first.page.locator("#coordinates input.number").first
     number.fill("-1.2")
     number.press("Enter")
@@ -152,28 +152,28 @@ def test_two_pages_show_one_pose(explore, look_at):
 
 
 def test_explorer_that_is_started_again_is_found_by_its_page(explore, look_at):
-    watched = explore("five_bar", token="0123456789abcdef")
-    port = int(watched.explorer.url.split(":")[2].split("/")[0])
-    visit = look_at(watched.explorer.url, READY)
-    watched.explorer.stop()
+    recorded = explore("five_bar", token="0123456789abcdef")
+    port = int(recorded.explorer.url.split(":")[2].split("/")[0])
+    visit = look_at(recorded.explorer.url, READY)
+    recorded.explorer.stop()
     visit.until("document.getElementById('status').textContent")
     again = explore("delta", port=port, token="0123456789abcdef")
     visit.until("document.getElementById('title').textContent === 'delta'")
-    assert again.explorer.url == watched.explorer.url
+    assert again.explorer.url == recorded.explorer.url
     visit.complaints[:] = [line for line in visit.complaints if "WebSocket" not in line]  # refused while it was away
 
 
 def test_random_input_leaves_no_error_and_no_growth(explore, look_at):
     """The memory of the page after many gestures is that after few, up to 50 MB."""
-    watched = explore("five_bar")
-    visit = look_at(watched.explorer.url, READY)
+    recorded = explore("five_bar")
+    visit = look_at(recorded.explorer.url, READY)
     random = np.random.default_rng(3)
     session = visit.page.context.new_cdp_session(visit.page)
     visit.page.evaluate("document.querySelectorAll('details').forEach(section => { section.open = true; })")
     memory = []
     for k in range(60):
         kind = int(random.integers(5))
-        places = visit.page.evaluate(BODY_POSITIONS, watched.paths)
+        places = visit.page.evaluate(BODY_POSITIONS, recorded.paths)
         x, y = places[int(random.integers(len(places)))]
         match kind:
             case 0 | 1:
@@ -190,4 +190,4 @@ def test_random_input_leaves_no_error_and_no_growth(explore, look_at):
             session.send("HeapProfiler.collectGarbage")
             memory.append(session.send("Runtime.getHeapUsage")["usedSize"])
     assert memory[1] - memory[0] < 50e6
-    assert np.array(watched.frames)[:, 1].max() <= MAX_CLOSURE
+    assert np.array(recorded.frames)[:, 1].max() <= MAX_CLOSURE

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cache as cached
 from pathlib import Path
 
 import pytest
+
+from ckc_pin.codegen import library
 
 
 @pytest.fixture(autouse=True)
 def cache(writable_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(writable_cache))
+    # Nor what tests with an unwritable cache have compiled earlier in the process.
+    monkeypatch.setattr(library, "_process_folder", cached(library._process_folder.__wrapped__))

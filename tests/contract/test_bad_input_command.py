@@ -23,7 +23,10 @@ CASES = [
     Bad(
         "unknown command",
         ["rnu"],
-        ["No such command 'rnu'", "check, terms, compile, run, inverse, linearize, sensitivities, sweep, plot, play"],
+        [
+            "No such command 'rnu'",
+            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, plot, play",
+        ],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
     Bad("missing argument", ["check"], ["ckc check: Missing argument 'MECHANISM|SCENE'", "--help"]),

@@ -14,6 +14,7 @@ from scripts.experiments.__main__ import app, main
 from tests.contract.helpers.command import Outcome, run_main
 
 ROOT = Path(__file__).parents[2]
+SCIPY_PEER = ROOT / "scripts" / "experiments" / "benchmark" / "peer_examples" / "scipy_peer.py"
 EXPERIMENTS = tuple(typer.main.get_command(app).commands)  # type: ignore[attr-defined]
 # Arguments of a part that takes seconds, and a text in its output. Other experiments take longer or need more programs.
 PARTS = {
@@ -24,6 +25,7 @@ PARTS = {
     "generated_sizes": (["1"], "| 1 | 3 |"),
     "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
+    "peer": ([f"{sys.executable} {SCIPY_PEER}", "tracking_1e-04"], "tracking_1e-04: not compared, the law of"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }
 HAS_OUT = {"paper", "ensembles"}

@@ -1,4 +1,4 @@
-"""Server of the explorer: who may use it, and what it does with requests."""
+"""Server of the explorer: access, and handling of valid and invalid requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ckc_pin.explorer.server import ExploreServer
 from ckc_pin.view import commands
 from ckc_pin.view.server import MAX_MESSAGE_BYTES
 from tests.contract.helpers.playback import leave, messages_to
-from tests.contract.helpers.viewer import listening
+from tests.contract.helpers.viewer import listening, status
 
 VECTOR = [0.1, -2.0, 3]
 REQUESTS: list[tuple[dict[str, Any], messages.Request]] = [
@@ -103,18 +103,6 @@ def serve_explorer() -> Iterator[Callable[..., Recorder]]:
     yield start
     for one in started:
         one.server.stop()
-
-
-def status(server: ExploreServer, path: str, **headers: str) -> int:
-    connection = HTTPConnection("127.0.0.1", server.port, timeout=20)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    return answer.status
 
 
 async def connect(server: ExploreServer, path: str | None = None, **headers: str) -> WebSocketClientConnection:

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from http.client import HTTPConnection
 from urllib.request import urlopen
 
 import msgspec
@@ -23,9 +22,8 @@ from tornado.websocket import websocket_connect
 from ckc_pin.errors import InputError
 from ckc_pin.view import commands
 from ckc_pin.view.player import play_runs
-from ckc_pin.view.server import ViewServer
 from tests.contract.helpers.playback import leave, messages_to, objects, placed
-from tests.contract.helpers.viewer import listening, raw_viewer, vanish
+from tests.contract.helpers.viewer import listening, raw_viewer, status, vanish
 
 
 def test_later_viewer_gets_the_current_scene(serve, swing):
@@ -53,18 +51,6 @@ def test_connected_viewer_gets_commands_immediately(serve, swing):
         return msgspec.msgpack.decode(message)
 
     assert asyncio.run(listen()) == {"type": "set_property", "path": "/Axes", "property": "visible", "value": True}
-
-
-def status(server: ViewServer, path: str, **headers: str) -> int:
-    connection = HTTPConnection("127.0.0.1", server.port, timeout=20)
-    connection.putrequest("GET", path, skip_host="Host" in headers)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    return answer.status
 
 
 @pytest.mark.parametrize("path", ["/", "/main.min.js", "/start.js", "/nothing"])

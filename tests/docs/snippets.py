@@ -33,7 +33,11 @@ from tests.contract.helpers.command import ckc
 BLOCK = re.compile(r"^( *)(```+|~~~+)(\{?[\w-]+\}?)[^\n]*\n(.*?)^\1\2 *$", re.MULTILINE | re.DOTALL)
 FILE = re.compile(r"^(?:#|<!--) ([\w./-]+\.(?:toml|urdf|xml|csv))\b")
 SHOWN = {"console", "csv", "bibtex", "json"}
-SERVERS = ("ckc play", "ckc run five_bar/swing --meshcat")  # open a server and wait: only their --help is run
+SERVERS = (
+    "ckc explore",
+    "ckc play",
+    "ckc run five_bar/swing --meshcat",
+)  # open a server and wait: only their --help is run
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def as_open(opened, path):
 
 
 class Desk:
-    """A session whose requests are handled at once, and what it sent."""
+    """A session whose requests are handled at once, and its messages to the pages."""
 
     def __init__(self, what, folder=None):
         self.posted = deque()

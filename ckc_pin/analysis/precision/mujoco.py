@@ -32,6 +32,7 @@ __all__ = [
 
 DYNAMICS_TOLERANCE = 1e-6  # relative; of mass matrix and bias, to check that both programs have one mechanism
 LARGEST_STEP, HALVINGS = 1e-2, 9  # of the span, at most 2 s of it; how often this step is halved
+WRONG_SPARSE_FACTOR = "4.0.0"  # of the Hessian with a sparse constraint Jacobian: MuJoCo's issue 3767, mended in 4.0.1
 INTEGRATORS = ("implicitfast", "RK4")
 STIFFNESSES = ("default", "solref 2 dt")  # MuJoCo's default, and the stiffest that its manual allows
 DEFAULT_SOLREF, DEFAULT_SOLIMP = [0.02, 1.0], [0.9, 0.95, 0.001, 0.5, 2.0]  # MuJoCo's
@@ -116,6 +117,8 @@ def load_model(mjcf: str) -> Any:
     model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
     for feature in DISABLED_FEATURES:
         model.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{feature}")
+    if mujoco.__version__ == WRONG_SPARSE_FACTOR:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     return model
 
 

@@ -1,4 +1,4 @@
-// Meshcat's viewer in a page of this program, and what its scripts share. Comes first in the script of every page.
+// Meshcat's viewer in a page of this program, and functions that all pages use. Comes first in every page's script.
 "use strict";
 
 // `var` makes the viewer reachable from the browser's console, and from the tests, as a property of the window.

@@ -15,7 +15,7 @@ from scripts.experiments.benchmark.ours import PROGRAM
 __all__ = ["KINDS", "NAMES", "TARGETS", "Analysis", "analyse", "compared", "eq_8", "families", "fastest"]
 
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
-KINDS = {"packaged": "the best packaged program", "by hand": "the loop written by hand"}
+KINDS = {"packaged": "the best packaged program", "by hand": "the best loop written by hand"}
 NAMES = {"dae": "DAE", "reduced": "reduced model", "spf, w": "SPF eq. 17", "spf, z": "SPF eq. 8 as printed"}
 EQUAL_TIME_RATIO = 1.1  # ratio of times below which two settings count as equally fast
 UNREACHED = 10.0  # ratio to the fastest time that counts for an accuracy which a setting does not reach

@@ -39,7 +39,7 @@ TABLES = ("report", "works", "checks", "growth", "left_out")
 Tables = dict[str, pd.DataFrame]
 
 
-def report(out: Path, *, quick: bool = False, from_tables: bool = False) -> list[Path]:
+def report(out: Path, *, quick: bool = False, from_tables: bool = False, added: Sequence[Peer] = ()) -> list[Path]:
     """Measure what is not in the cache, and write tables, figures and page; return the files.
 
     Parameters
@@ -50,6 +50,8 @@ def report(out: Path, *, quick: bool = False, from_tables: bool = False) -> list
         Fewer motions, methods and tolerances.
     from_tables : bool
         Measure nothing and use the tables in the folder.
+    added : sequence of Peer
+        Programs beside those of `peers`.
 
     Raises
     ------
@@ -58,7 +60,7 @@ def report(out: Path, *, quick: bool = False, from_tables: bool = False) -> list
     """
     out.mkdir(parents=True, exist_ok=True)
     if not from_tables:
-        save(out, *measure(quick, Memory(CACHE, verbose=0)))
+        save(out, *measure(quick, Memory(CACHE, verbose=0), added))
     return write(out)
 
 
@@ -93,10 +95,10 @@ def write(out: Path) -> list[Path]:
     return [out / name for name in ("report.md", *(f"{name}.csv.gz" for name in TABLES), *figures)]
 
 
-def measure(quick: bool, memory: Memory) -> tuple[Tables, dict[str, Any]]:
+def measure(quick: bool, memory: Memory, added: Sequence[Peer] = ()) -> tuple[Tables, dict[str, Any]]:
     """Measure everything that is not in the cache; return the tables and the data about all of them."""
     works, unmade = _available_works(quick)
-    others = peers()
+    others = [*peers(), *added]
     rows = [row for work in works for row in rows_of(work, quick, memory, others)]
     checks = [
         {"program": peer.name, "version": "" if missing else peer.version(), "packaged": peer.packaged,

@@ -29,7 +29,7 @@ from tests.analytic.five_bar import FIVE_BAR, Q
 SHORT_WORK = Work("short", "five-bar, free swing, 0.1 s", "five_bar/swing", 0.1, quick=True)
 BY_KEY = {work.key: work for work in WORKS}
 DOCS = Path(__file__).parents[3] / "docs" / "report"
-LOOP = "Pinocchio constraintDynamics, RKF78 in C++"
+LOOPS = {f"Pinocchio {algorithm}, RKF78 in C++" for algorithm in ("constraintDynamics", "lcaba")}
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_other_programs_compute_the_same_motion(exact: Reference) -> None:
         "Pinocchio constraintDynamics": "K_p 10, dt 6.25e-05",
         "SUNDIALS IDA": "rtol 1e-05",
     }
-    for peer in (peer for peer in peers() if peer.name != LOOP):  # the loop program has separate tests
+    for peer in (peer for peer in peers() if peer.name not in LOOPS):  # the loops have separate tests
         assert peer.missing(SHORT_WORK) is None
         assert settings[peer.name] in set(peer.settings(SHORT_WORK, quick=False))
         theirs = compare_with_reference(
@@ -195,7 +195,7 @@ def test_missing_programs_give_reason() -> None:
     for name in set(render_blocks) - {"SUNDIALS IDA"}:
         assert render_blocks[name]
     assert render_blocks["SUNDIALS IDA"] is None
-    andrews = {peer.name: peer.missing(BY_KEY["andrews"]) for peer in peers() if peer.name != LOOP}
+    andrews = {peer.name: peer.missing(BY_KEY["andrews"]) for peer in peers() if peer.name not in LOOPS}
     assert andrews["Pinocchio constraintDynamics"]
 
 

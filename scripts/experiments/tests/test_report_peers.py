@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ckc_pin.analysis.precision.mujoco import load_model
+from ckc_pin.formats.exporting import export
 from ckc_pin.run.simulate import simulate
 from scripts.experiments.benchmark.peers import Peer, peers
 from scripts.experiments.benchmark.peers.exudyn_plane import in_plane
@@ -28,6 +30,7 @@ SPRING = Work("spring", "Andrews' squeezer, 2 ms", "andrews", 0.002)
         (DRAKE, SWING, "RungeKutta3, bushings of 1e+06 N/m, accuracy 0.001", 1e-3),
         (DRAKE, SPRING, "RungeKutta3, bushings of 1e+08 N/m, accuracy 0.001", 2e-3),
         (MUJOCO, TURNS, "RK4, solref 2 dt, dt 0.0003", 1e-3),
+        (MUJOCO, TURNS, "discrete, solref 2 dt, dt 2.5e-05", 1e-2),
         (MUJOCO, SPRING, "RK4, solref 4 dt, dt 1e-05", 1e-3),
     ],
 )
@@ -37,6 +40,16 @@ def test_program_computes_the_same_motion(peer: Peer, work: Work, setting: str, 
     assert motion.status == "done", motion.reason
     assert np.abs(motion.q_tree - run.q_tree).max() < allowed
     assert np.abs(motion.v_tree - run.v_tree).max() < allowed * max(1.0, float(np.abs(run.v_tree).max()))
+
+
+def test_large_models_of_mujoco_have_a_dense_constraint_jacobian_where_its_sparse_factor_is_wrong() -> None:
+    """Above 60 coordinates MuJoCo chooses a sparse one by itself."""
+    import mujoco
+
+    mechanism = BY_KEY["n_four_bar_40"].mechanism
+    model = load_model(export(mechanism, "mjcf").text)
+    assert model.nv == mechanism.tree.n > 60
+    assert mujoco.mj_isSparse(model) == (mujoco.__version__ != "4.0.0")
 
 
 def test_state_round_trips_through_program() -> None:

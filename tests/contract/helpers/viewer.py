@@ -1,15 +1,16 @@
-"""A minimal viewer, and the addresses that a process listens on."""
+"""A minimal viewer, answers of a server, and the addresses that a process listens on."""
 
 from __future__ import annotations
 
 import os
 import socket
 import struct
+from http.client import HTTPConnection
 from pathlib import Path
 
 from ckc_pin.view.server import ViewServer
 
-__all__ = ["listening", "raw_viewer", "vanish"]
+__all__ = ["listening", "raw_viewer", "status", "vanish"]
 
 
 def raw_viewer(server: ViewServer) -> socket.socket:
@@ -21,6 +22,19 @@ def raw_viewer(server: ViewServer) -> socket.socket:
     )
     assert viewer.recv(12) == b"HTTP/1.1 101"
     return viewer
+
+
+def status(server: ViewServer, path: str, **headers: str) -> int:
+    """Return the status of the answer to a GET request with some headers."""
+    connection = HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status
 
 
 def vanish(viewer: socket.socket) -> None:

@@ -47,4 +47,5 @@ def peers() -> list[Peer]:
     from scripts.experiments.benchmark.peers.pinocchio import Pinocchio
     from scripts.experiments.benchmark.peers.pinocchio_loop import PinocchioLoop
 
-    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), PinocchioLoop(), Ida()]
+    loops = [PinocchioLoop("constraintDynamics"), PinocchioLoop("lcaba")]
+    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), *loops, Ida()]

@@ -33,7 +33,7 @@ COARSEST, STEPS, QUICK_STEPS, SOFT_STEPS = (
     8,
     5,
 )  # s, and numbers of halvings; few for default constraints, whose softness dominates
-INTEGRATORS = ("Euler", "implicitfast", "implicit", "RK4")
+INTEGRATORS = ("Euler", "implicitfast", "implicit", "RK4", "discrete")  # discrete: since MuJoCo 4
 QUICK_INTEGRATORS = ("implicitfast", "RK4")
 DEFAULT, STIFF, FIRM = "default", "solref 2 dt", "solref 4 dt"  # time constants of the constraints
 
@@ -62,8 +62,12 @@ class Mujoco:
         return metadata.version("mujoco")
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        import mujoco
+
         integrators, steps = (QUICK_INTEGRATORS, QUICK_STEPS) if quick else (INTEGRATORS, STEPS)
         for integrator in integrators:
+            if not hasattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"):
+                continue
             stiffnesses = {DEFAULT: SOFT_STEPS, STIFF: steps, **({FIRM: steps} if integrator == "RK4" else {})}
             for stiffness, many in stiffnesses.items():
                 for dt in halved_steps(work, COARSEST, many):

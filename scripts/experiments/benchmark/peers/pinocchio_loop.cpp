@@ -1,7 +1,9 @@
-// What a capable user of Pinocchio would write: constraintDynamics under Boost.Odeint's Runge-Kutta-Fehlberg 7(8) with
-// its own step control. Reads one problem from standard input, writes the motion at its instants and what it took.
+// What a capable user of Pinocchio would write: constraintDynamics or lcaba under Boost.Odeint's Runge-Kutta-Fehlberg
+// 7(8) with its own step control. Reads one problem from standard input, writes the motion at its instants and its cost.
 #include <pinocchio/algorithm/energy.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
+#include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/loop-constrained-aba.hpp>
 #include <pinocchio/algorithm/proximal.hpp>
 #include <pinocchio/constraints.hpp>
 #include <pinocchio/multibody.hpp>
@@ -16,7 +18,7 @@
 #include <iostream>
 #include <stdexcept>
 
-// As in Pinocchio's headers, whose definitions take a compiler half a minute: the library has them compiled.
+// constraintDynamics is declared here, because its header takes a compiler half a minute. The library contains it.
 namespace pinocchio {
 template <typename Scalar, int Options, template <typename, int> class Collection, class Constraint, class Allocator,
           class ConstraintData, class DataAllocator>
@@ -100,6 +102,7 @@ struct Problem {
   pin::Data data;
   std::vector<pin::RigidConstraintModel> constraints;
   std::vector<pin::RigidConstraintData> constraint_data;
+  bool by_lcaba;
   pin::ProximalSettings proximal;
   std::vector<Spring> springs;
   Vector stiffness, rest, damping, constant;  // on joints
@@ -109,18 +112,24 @@ struct Problem {
   std::size_t rhs = 0;
 
   Problem() : model(read_model()), data(model) {
+    by_lcaba = read<std::string>() == "lcaba";
     const double gain = read<double>();
     for (auto remaining = read<int>(); remaining > 0; --remaining) {
       const auto type = read<int>() == 6 ? pin::CONTACT_6D : pin::CONTACT_3D;
-      const auto a = read<pin::JointIndex>();
-      const pin::SE3 on_a = read_placement();
-      const auto b = read<pin::JointIndex>();
-      constraints.emplace_back(type, model, a, on_a, b, read_placement(), pin::LOCAL);
+      auto a = read<pin::JointIndex>();
+      pin::SE3 on_a = read_placement();
+      auto b = read<pin::JointIndex>();
+      pin::SE3 on_b = read_placement();
+      if (a == 0) std::swap(a, b), std::swap(on_a, on_b);  // lcaba takes the world as the second body only
+      constraints.emplace_back(type, model, a, on_a, b, on_b, pin::LOCAL);
       constraints.back().m_baumgarte_parameters.Kp = gain;
       constraints.back().m_baumgarte_parameters.Kd = 2 * std::sqrt(gain);
       constraint_data.push_back(constraints.back().createData());
     }
-    pin::initConstraintDynamics(model, data, constraints, constraint_data);
+    if (by_lcaba)
+      pin::computeJointMinimalOrdering(model, data, constraints);
+    else
+      pin::initConstraintDynamics(model, data, constraints, constraint_data);
     const auto accuracy = read<double>(), mu = read<double>();
     proximal = pin::ProximalSettings(accuracy, mu, read<int>());
     for (auto remaining = read<int>(); remaining > 0; --remaining) {
@@ -151,6 +160,8 @@ struct Problem {
     tau = constant - damping.cwiseProduct(v);
     if (model.nq == model.nv) tau -= stiffness.cwiseProduct(q - rest);
     if (!springs.empty()) pull();
+    if (by_lcaba && constraints.size() && constraints[0].m_baumgarte_parameters.Kp > 0) update_errors_of_points();
+    if (by_lcaba) return pin::lcaba(model, data, q, v, tau, constraints, constraint_data, proximal);
     return pin::constraintDynamics(model, data, q, v, tau, constraints, constraint_data, proximal);
   }
 
@@ -174,6 +185,21 @@ struct Problem {
       const Eigen::Quaterniond twice = turned * Eigen::Quaterniond(0, w.x(), w.y(), w.z());
       for (int k : {0, 1, 2}) rate[at + k] = p_dot[k];
       for (int k : {0, 1, 2, 3}) rate[at + 3 + k] = 0.5 * twice.coeffs()[k];
+    }
+  }
+
+  // lcaba of Pinocchio 4.1 reads the errors of point constraints for its Baumgarte terms, but does not compute them.
+  void update_errors_of_points() {
+    pin::forwardKinematics(model, data, q, v);
+    for (std::size_t k = 0; k < constraints.size(); ++k) {
+      const auto& constraint = constraints[k];
+      if (constraint.type != pin::CONTACT_3D) continue;
+      const auto a = constraint.joint1_id, b = constraint.joint2_id;
+      const pin::SE3 on_a = constraint.joint1_placement, on_b = constraint.joint2_placement;
+      const pin::SE3 b_in_a = (data.oMi[a] * on_a).actInv(data.oMi[b] * on_b);
+      constraint_data[k].contact_placement_error.linear() = -b_in_a.translation();
+      constraint_data[k].contact_velocity_error.linear() =
+          on_a.actInv(data.v[a]).linear() - b_in_a.rotation() * on_b.actInv(data.v[b]).linear();
     }
   }
 
@@ -213,10 +239,14 @@ void check(Problem& problem) {
   State rate(problem.start.size());
   problem(problem.start, rate, 0.0);
   const pin::Model& model = problem.model;
-  const Eigen::MatrixXd D = problem.data.M.selfadjointView<Eigen::Upper>();
+  pin::Data data(model);  // of constraintDynamics, which leaves D' and the bias there
+  pin::initConstraintDynamics(model, data, problem.constraints, problem.constraint_data);
+  pin::constraintDynamics(model, data, problem.q, problem.v, problem.tau, problem.constraints, problem.constraint_data,
+                          problem.proximal);
+  const Eigen::MatrixXd D = data.M.selfadjointView<Eigen::Upper>();
   write("D", D.data(), D.size());
-  write("bias", problem.data.nle.data(), model.nv);
-  const double energy = pin::computeMechanicalEnergy(model, problem.data, problem.q, problem.v);
+  write("bias", data.nle.data(), model.nv);
+  const double energy = pin::computeMechanicalEnergy(model, data, problem.q, problem.v);
   write("energy", &energy, 1);
   write("acceleration", rate.data() + model.nq, model.nv);
 }

@@ -1,4 +1,4 @@
-"""Run works with Pinocchio's constraintDynamics and Boost.Odeint's Runge-Kutta-Fehlberg 7(8), a C++ loop."""
+"""Run works with Pinocchio's constraintDynamics or lcaba and Boost.Odeint's Runge-Kutta-Fehlberg 7(8), a C++ loop."""
 
 from __future__ import annotations
 
@@ -25,9 +25,22 @@ __all__ = ["PinocchioLoop"]
 TOLERANCES = tuple(10.0**-k for k in range(2, 14))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 GAINS = (0.0, 100.0)  # K_p, 1/s^2; K_d = 2 sqrt(K_p)
-# Proximal parameter mu and number of iterations. One iteration is cheapest; where J loses rank, mu must be large.
-PROXIMAL = ((1e-12, 1), (1e-8, 3), (1e-4, 10), (1e-2, 12))
-QUICK_PROXIMAL = (PROXIMAL[0], PROXIMAL[2])
+# Proximal parameter mu, number of iterations, and the tightest tolerance that is tried with them. One iteration is
+# cheapest; where J loses rank, mu must be large. lcaba adds J^T J / mu to the inertias: its accelerations carry a
+# rounding error of about 1e-14 / mu, and each iteration multiplies the error of the constraints by about mu / sigma^2,
+# sigma the singular values of J M^{-1/2}. The settings were chosen by the errors of accelerations along the works.
+PROXIMAL = {
+    "constraintDynamics": ((1e-12, 1, 1e-13), (1e-8, 3, 1e-13), (1e-4, 10, 1e-13), (1e-2, 12, 1e-13)),
+    "lcaba": (
+        *((1e-7, 1, 1e-8), (1e-6, 2, 1e-10), (1e-4, 3, 1e-12), (1e-3, 5, 1e-13)),
+        *((1e-4, 10, 1e-12), (1e-2, 12, 1e-13)),
+    ),
+}
+QUICK_PROXIMAL = {
+    "constraintDynamics": PROXIMAL["constraintDynamics"][::2],
+    "lcaba": (*PROXIMAL["lcaba"][1:3], PROXIMAL["lcaba"][4]),
+}
+CHECKED = {"constraintDynamics": (1e-8, 3), "lcaba": (1e-3, 5)}  # mu and iterations of the comparison at the start
 ACCURACY = 1e-13  # accuracy of the multipliers at which the proximal iterations end
 START = 5.0  # s: allowance for the start of the program
 
@@ -35,10 +48,19 @@ Answer = dict[str, list[list[float]]]  # numbers of the program's output lines, 
 
 
 class PinocchioLoop:
-    """Adaptive explicit integration with Pinocchio, as an experienced user would write it in C++."""
+    """Adaptive explicit integration with Pinocchio, as an experienced user would write it in C++.
 
-    name = "Pinocchio constraintDynamics, RKF78 in C++"
+    Parameters
+    ----------
+    algorithm : "constraintDynamics" or "lcaba"
+        The function of Pinocchio that computes the accelerations.
+    """
+
     packaged = False  # the loop is written by hand
+
+    def __init__(self, algorithm: str) -> None:
+        self.algorithm = algorithm
+        self.name = f"Pinocchio {algorithm}, RKF78 in C++"
 
     def missing(self, work: Work) -> str | None:
         return closure_unsupported(work) or program()[1]
@@ -47,15 +69,17 @@ class PinocchioLoop:
         return version()
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
-        proximal = QUICK_PROXIMAL if quick else PROXIMAL
-        for gain, (mu, iterations), tolerance in product(GAINS, proximal, QUICK_TOLERANCES if quick else TOLERANCES):
-            yield f"K_p {gain:g}, mu {mu:g}, iterations {iterations}, tolerance {tolerance:g}"
+        proximal, tolerances = (QUICK_PROXIMAL, QUICK_TOLERANCES) if quick else (PROXIMAL, TOLERANCES)
+        for gain, (mu, iterations, tightest) in product(GAINS, proximal[self.algorithm]):
+            for tolerance in tolerances:
+                if tolerance >= tightest:
+                    yield f"K_p {gain:g}, mu {mu:g}, iterations {iterations}, tolerance {tolerance:g}"
 
     def check(self, work: Work) -> str:
         """Compare D', the bias, the energy and the constrained acceleration at the start."""
         mechanism, tree = work.mechanism, work.mechanism.tree
         q_tree, v_tree = start_of(work)
-        answer = _answer(_problem(work, 0.0, *PROXIMAL[1], TOLERANCES[0], []), None)
+        answer = _answer(_problem(work, self.algorithm, 0.0, *CHECKED[self.algorithm], TOLERANCES[0], []), None)
         numbers = {name: np.array(lines[0]) for name, lines in answer.items()}
         terms = Terms(mechanism, mechanism.kinematics(q_tree), v_tree)
         bias = pin.nonLinearEffects(tree.model, tree.data, q_tree, v_tree)
@@ -72,7 +96,8 @@ class PinocchioLoop:
         gain, mu, iterations, tolerance = (float(part.split()[1]) for part in setting.split(", "))
         tree = work.mechanism.tree
         try:
-            answer = _answer(_problem(work, gain, mu, int(iterations), tolerance, work.instants), budget)
+            problem = _problem(work, self.algorithm, gain, mu, int(iterations), tolerance, work.instants)
+            answer = _answer(problem, budget)
         except subprocess.TimeoutExpired:
             return motion_without_data("refused", f"takes longer than the budget, {budget:.0f} s")
         except subprocess.CalledProcessError as error:
@@ -97,14 +122,20 @@ def _answer(problem: str, budget: float | None) -> Answer:
 
 
 def _problem(
-    work: Work, gain: float, mu: float, iterations: int, tolerance: float, instants: Sequence[float] | Array
+    work: Work,
+    algorithm: str,
+    gain: float,
+    mu: float,
+    iterations: int,
+    tolerance: float,
+    instants: Sequence[float] | Array,
 ) -> str:
     """Return a work as the program's input; without instants the program only evaluates the start."""
     mechanism = work.mechanism
     constraints = list(closure_constraints(mechanism))
     q_tree, v_tree = start_of(work)
     kinds = {pin.ContactType.CONTACT_3D: 3, pin.ContactType.CONTACT_6D: 6}
-    parts: list[Any] = [*_tree(mechanism), gain, len(constraints)]
+    parts: list[Any] = [*_tree(mechanism), algorithm, gain, len(constraints)]
     for kind, joint_a, on_a, joint_b, on_b in constraints:
         parts += [kinds[kind], joint_a, *_placed(on_a), joint_b, *_placed(on_b)]
     parts += [ACCURACY, mu, iterations, *_springs(mechanism), tolerance, *q_tree, *v_tree]
