@@ -18,9 +18,10 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
 
-__all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns"]
+__all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns", "remove_direction"]
 
 TIE_TOLERANCE = 1e-8  # relative: of pivots closer than this the first is taken, since rounding differs by machine
+MIN_SPARSE_SIZE = 20_000  # entries of a matrix whose zeros are worth skipping
 SCIPY = "scipy.linalg"  # comes with a BLAS library of its own
 
 
@@ -202,16 +203,36 @@ def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:
     """
     remainder = matrix.copy()
     order = np.arange(matrix.shape[1])
+    sizes = np.linalg.norm(remainder, axis=0)
     pivots = np.zeros(min(matrix.shape))
     for k in range(len(pivots)):
-        sizes = np.linalg.norm(remainder[:, order[k:]], axis=0)
-        largest = sizes.max()
+        left = sizes[order[k:]]
+        largest = left.max()
         if not largest > 0:
             break
-        best = int(np.argmax(sizes > (1 - TIE_TOLERANCE) * largest))
+        best = int(np.argmax(left > (1 - TIE_TOLERANCE) * largest))
         order[[k, k + best]] = order[[k + best, k]]
-        pivots[k] = sizes[best]
-        direction = remainder[:, order[k]] / sizes[best]
-        others = order[k + 1 :]
-        remainder[:, others] -= np.outer(direction, direction @ remainder[:, others])
+        pivots[k] = left[best]
+        remove_direction(remainder, remainder[:, order[k]] / left[best], order[k + 1 :], sizes)
     return order, pivots
+
+
+def remove_direction(matrix: Array, direction: Array, columns: IntArray, sizes: Array) -> None:
+    """Make columns orthogonal to a unit vector, and update their norms; zeros of a sparse matrix take no time.
+
+    Parameters
+    ----------
+    matrix : (m, n) array, changed
+    direction : (m,) array
+    columns : int array
+    sizes : (n,) array, changed
+        Norms of all columns.
+    """
+    if matrix.size < MIN_SPARSE_SIZE:
+        matrix[:, columns] -= np.outer(direction, direction @ matrix[:, columns])
+    else:
+        rows = np.flatnonzero(direction)
+        parts = direction[rows] @ matrix[np.ix_(rows, columns)]
+        columns = columns[np.flatnonzero(parts)]
+        matrix[np.ix_(rows, columns)] -= np.outer(direction[rows], parts[parts != 0.0])
+    sizes[columns] = np.linalg.norm(matrix[:, columns], axis=0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
-from ckc_pin.base.linear_algebra import pivoted_columns
+from ckc_pin.base.linear_algebra import pivoted_columns, remove_direction
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.tree import Tree
@@ -141,11 +141,11 @@ def choose_dependent_by_priority(
         return None
     z: list[int] = []
     remainder, sizes = scaled_jacobian.copy(), np.linalg.norm(scaled_jacobian, axis=0)
+    columns, remaining = np.arange(len(sizes)), sizes.copy()
 
     def make_dependent(k: int) -> None:
-        direction = remainder[:, k] / np.linalg.norm(remainder[:, k])
-        remainder[:] -= np.outer(direction, direction @ remainder)
-        remainder[:, k] = 0.0
+        remove_direction(remainder, remainder[:, k] / remaining[k], columns, remaining)
+        remainder[:, k] = remaining[k] = 0.0
         z.append(k)
 
     for k in inside[pivoted_columns(scaled_jacobian[:, inside])[0]] if len(inside) else ():
@@ -156,10 +156,10 @@ def choose_dependent_by_priority(
     for group, threshold in ((others, GOOD_PIVOT), (others, MIN_PIVOT), (last, GOOD_PIVOT)):
         for k in group:
             limit = max(threshold * sizes[k], RANK_TOLERANCE * sizes.max(initial=0.0))
-            if len(z) < rank and float(np.linalg.norm(remainder[:, k])) > limit:
+            if len(z) < rank and remaining[k] > limit:
                 make_dependent(k)
     while len(z) < rank:
-        make_dependent(int(np.argmax(np.linalg.norm(remainder, axis=0))))
+        make_dependent(int(np.argmax(remaining)))
     return np.sort(np.array(z, dtype=np.intp))
 
 

@@ -27,11 +27,33 @@ from ckc_pin.errors import InputError, MechanismError
 __all__ = ["Tree"]
 
 
-MAX_COORDINATES = 325  # Pinocchio's workspace takes about 65 n^3 bytes, here 2.2 GB
+MAX_COORDINATES = 1000  # the factorizations of one state then take seconds
+MAX_FULL_WORKSPACE = 325  # coordinates; a full workspace takes about 65 n^3 bytes, here 2.2 GB
 LARGE_COORDINATE = 100.0  # rad, or mechanism sizes: above it, rounding of a coordinate shows in the closure of loops
 MAX_TOLERANCE_FACTOR = 1e4  # reached at a million radians; a closure to 1e-13 of the size is then one to 1e-9
 UNLIMITED = 1e300  # joint limits of this size and above mean that there is no limit
-WORKSPACE = ("data", "lock", "_placement", "_jacobian", "_jacobian_dot")  # attributes that copies do not share
+# attributes that copies do not share
+WORKSPACE = ("data", "lock", "_workspace", "_placement", "_jacobian", "_jacobian_dot")
+
+# Algorithms that do not need a full workspace.
+FAST = frozenset(
+    (
+        pin.nonLinearEffects,
+        pin.computeGeneralizedGravity,
+        pin.computeCoriolisMatrix,
+        pin.computePotentialEnergy,
+        pin.centerOfMass,
+    )
+)
+_ZERO_BY_JOINT: dict[tuple[str, ...], Any] = {
+    ("v", "ov", "a", "oa", "a_gf", "oa_gf"): pin.Motion.Zero(),
+    ("f", "of", "h", "oh"): pin.Force.Zero(),
+    ("oMi", "liMi"): pin.SE3.Identity(),
+    ("Ycrb", "oYcrb"): pin.Inertia.Zero(),
+    ("B", "vxI", "Ivx"): np.zeros((6, 6)),
+    ("com", "vcom", "acom"): np.zeros(3),
+    ("mass",): -1.0,
+}
 
 _ROOT_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -125,21 +147,36 @@ class Tree:
 
     @cached_property
     def data(self) -> Any:
-        """Pinocchio's workspace of about n^3 numbers, created at first use."""
+        """A full workspace for any algorithm of Pinocchio, created at first use.
+
+        Raises
+        ------
+        MechanismError
+            The tree has so many coordinates that the workspace, of about 65 n^3 bytes, would fill the memory.
+        """
+        if self.n > MAX_FULL_WORKSPACE:
+            raise MechanismError(
+                f"the tree has {self.n} coordinates; this analysis needs a workspace of Pinocchio, which takes too much"
+                f" memory for more than {MAX_FULL_WORKSPACE}"
+            )
         return self.model.createData()
 
     @cached_property
+    def _workspace(self) -> Any:
+        return _create_workspace(self.model)
+
+    @cached_property
     def _placement(self) -> Array:
-        return _strided_placements(self.data)
+        return _strided_placements(self._workspace)
 
     # Pinocchio returns a matrix of one column as a vector, hence the reshape.
     @cached_property
     def _jacobian(self) -> Array:
-        return self.data.J.reshape(6, self.n)
+        return self._workspace.J.reshape(6, self.n)
 
     @cached_property
     def _jacobian_dot(self) -> Array:
-        return self.data.dJ.reshape(6, self.n)
+        return self._workspace.dJ.reshape(6, self.n)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Tree:
         """Copy the model, with a new workspace. Names and indices are shared."""
@@ -159,16 +196,17 @@ class Tree:
     def evaluate(self, algorithm: Callable[..., Any], *state: Array) -> Array:
         """Call an algorithm of Pinocchio, (model, data, *state), and return a copy of its result."""
         with self.lock:
-            return np.array(algorithm(self.model, self.data, *state))
+            return np.array(algorithm(self.model, self._workspace if algorithm in FAST else self.data, *state))
 
     def mass_matrix(self, q_tree: Array) -> Array:
         """Return D' with all rotors, shape (n, n)."""
-        return self.evaluate(pin.crba, q_tree) + self.rotors
+        with self.lock:
+            return np.asarray(pin.crba(self.model, self._workspace, q_tree, pin.Convention.WORLD)) + self.rotors
 
     def kinematics(self, q_tree: Array) -> tuple[Array, Array]:
         """Placements (joints, 12; rotation by columns, then translation) and world Jacobian (6, n)."""
         with self.lock:
-            pin.computeJointJacobians(self.model, self.data, q_tree)
+            pin.computeJointJacobians(self.model, self._workspace, q_tree)
             return self._placement.copy(), self._jacobian.copy()
 
     def many_kinematics(self, q_tree: Array) -> tuple[Array, Array]:
@@ -176,14 +214,14 @@ class Tree:
         with self.lock:
             placement, jacobian = np.empty((len(q_tree), *self._placement.shape)), np.empty((len(q_tree), 6, self.n))
             for k, q in enumerate(q_tree):
-                pin.computeJointJacobians(self.model, self.data, q)
+                pin.computeJointJacobians(self.model, self._workspace, q)
                 placement[k], jacobian[k] = self._placement, self._jacobian
         return placement, jacobian
 
     def jacobian_dot(self, q_tree: Array, v_tree: Array) -> Array:
         """Return the time derivative of the world Jacobian along v', shape (6, n)."""
         with self.lock:
-            pin.computeJointJacobiansTimeVariation(self.model, self.data, q_tree, v_tree)
+            pin.computeJointJacobiansTimeVariation(self.model, self._workspace, q_tree, v_tree)
             return self._jacobian_dot.copy()
 
     def limits(self) -> tuple[Array, Array]:
@@ -338,6 +376,38 @@ def _q_indices(model: Any) -> list[int]:
     for joint in list(model.joints)[1:]:
         indices += [joint.idx_q] if joint.nv == 1 else [joint.idx_q + k for k in (0, 1, 2, 3, 4, 5)]
     return indices
+
+
+def _create_workspace(model: Any) -> Any:
+    """Return a workspace for `mass_matrix`, `kinematics`, `jacobian_dot` and the algorithms of `FAST`.
+
+    Pinocchio's own has tensors of 40 n^3 bytes for second derivatives, which nothing here computes.
+    """
+    n, joints, data = model.nv, model.njoints, pin.Data()
+    for joint in model.joints:
+        data.joints.append(joint.createData())
+    for names, start in _ZERO_BY_JOINT.items():
+        for name in names:
+            getattr(data, name).extend([start] * joints)
+    for name in ("J", "dJ", "Ag", "dAg", "dAdq", "dFda", "dFdq", "dFdv"):
+        setattr(data, name, np.zeros((6, n)))
+    for name in ("tau", "nle", "g"):
+        setattr(data, name, np.zeros(n))
+    for name in ("M", "C"):
+        setattr(data, name, np.zeros((n, n)))
+    data.Fcrb.append(np.zeros((6, n)))  # the only one that is used
+    data.a_gf[0] = -model.gravity
+    parents, first, size = list(model.parents), list(model.idx_vs), list(model.nvs)
+    above, below = [-1] * n, [0] * joints  # by coordinate: the one above it; by joint: the number at and below it
+    for joint in range(joints - 1, 0, -1):
+        parent = parents[joint]
+        below[joint] += size[joint]
+        below[parent] += below[joint]
+        above[first[joint] : first[joint] + size[joint]] = range(first[joint] - 1, first[joint] + size[joint] - 1)
+        above[first[joint]] = first[parent] + size[parent] - 1 if parent else -1
+    data.nvSubtree.extend(below)
+    data.parents_fromRow.extend(above)
+    return data
 
 
 def _strided_placements(data: Any) -> Array:

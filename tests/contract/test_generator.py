@@ -88,7 +88,7 @@ def test_generated_mechanism_can_be_saved_and_loaded(tmp_path: Path) -> None:
 
 
 def test_too_large_tree_is_rejected(tmp_path: Path) -> None:
-    """Pinocchio's workspace grows with the cube of the coordinates, so a small file could exhaust the memory."""
+    """Factorizations take a time that grows with the cube of the coordinates, so a small file could take hours."""
     links = "".join(f'<link name="l{k}"/>' for k in range(MAX_COORDINATES + 2))
     joints = "".join(
         f'<joint name="j{k}" type="continuous"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'

@@ -18,10 +18,43 @@ namespace ckc {
 
 namespace pin = pinocchio;
 
+// A workspace with the members that the algorithms of this file use. Pinocchio's own has tensors of 40 n^3 bytes for second
+// derivatives, which nothing here computes.
+static pin::Data make_data(const pin::Model& model) {
+  pin::Data data;
+  const Eigen::Index n = model.nv;
+  const size_t joints = model.njoints;
+  for (const auto& joint : model.joints) data.joints.push_back(joint.createData());
+  for (auto* motions : {&data.v, &data.ov, &data.a, &data.oa, &data.a_gf, &data.oa_gf})
+    motions->assign(joints, pin::Motion::Zero());
+  for (auto* forces : {&data.f, &data.of, &data.h, &data.oh}) forces->assign(joints, pin::Force::Zero());
+  for (auto* placements : {&data.oMi, &data.liMi}) placements->assign(joints, pin::SE3::Identity());
+  for (auto* inertias : {&data.Ycrb, &data.oYcrb, &data.oinertias}) inertias->assign(joints, pin::Inertia::Zero());
+  for (auto* matrices : {&data.vxI, &data.Ivx, &data.B, &data.doYcrb}) matrices->assign(joints, Matrix6::Zero());
+  for (auto* points : {&data.com, &data.vcom, &data.acom}) points->assign(joints, Vector3::Zero());
+  for (auto* columns : {&data.J, &data.dJ, &data.Ag, &data.dAg, &data.dVdq, &data.dAdq, &data.dAdv, &data.dFdq, &data.dFdv,
+                        &data.dFda})
+    columns->setZero(6, n);
+  for (auto* vector : {&data.tau, &data.nle, &data.g}) vector->setZero(n);
+  for (auto* matrix : {&data.M, &data.C}) matrix->setZero(n, n);
+  for (auto* matrix : {&data.dtau_dq, &data.dtau_dv}) matrix->setZero(n, n);
+  data.Fcrb.assign(1, pin::Data::Matrix6x::Zero(6, n));  // the only one that is used
+  data.mass.assign(joints, -1.0);
+  data.a_gf[0] = -model.gravity;
+  data.nvSubtree.assign(joints, 0), data.parents_fromRow.assign(n, -1);
+  for (size_t joint = joints - 1; joint > 0; --joint) {
+    const size_t parent = model.parents[joint];
+    data.nvSubtree[joint] += model.nvs[joint], data.nvSubtree[parent] += data.nvSubtree[joint];
+    for (int k = 1; k < model.nvs[joint]; ++k) data.parents_fromRow[model.idx_vs[joint] + k] = model.idx_vs[joint] + k - 1;
+    if (parent) data.parents_fromRow[model.idx_vs[joint]] = model.idx_vs[parent] + model.nvs[parent] - 1;
+  }
+  return data;
+}
+
 struct Tree::Workspace {
   pin::Model model;
   pin::Data data;
-  explicit Workspace(pin::Model&& loaded) : model(std::move(loaded)), data(model) {}
+  explicit Workspace(pin::Model&& loaded) : model(std::move(loaded)), data(make_data(model)) {}
 };
 
 static pin::Model load_model(const std::string& serialized) {
