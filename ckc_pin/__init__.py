@@ -19,6 +19,7 @@ Subpackages, bottom to top; a module imports only from subpackages below its own
 `run`                        simulation, runs, the stepwise simulator, inverse dynamics
 `linear`, `sensitivity`      linear models and stability; derivatives of runs, Floquet multipliers
 `ensembles`                  many runs with different parameters
+`identification`             parameters from measurements, and motions that make them known
 `formats`, `analysis`        import and export; checks, singularity maps, work-precision reports
 `view`, `explorer`, `cli`    figures and 3-D playback; the explorer in the browser; the command `ckc`
 ============================ ==========================================================================

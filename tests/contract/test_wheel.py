@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "base", "cli", "codegen", "control",
-         "dynamics", "ensembles", "explorer", "formats", "kinematics", "linear", "mechanism", "native", "run", "scene",
+         "dynamics", "ensembles", "explorer", "formats", "identification", "kinematics", "linear", "mechanism", "native", "run", "scene",
          "sensitivity", "urdf", "view"}  # fmt: skip
 
 
