@@ -61,7 +61,7 @@ class LinearFit(Immutable):
     rank: int
 
     def combinations(self) -> tuple[IntArray, Array]:
-        """Return one unknown for each determined direction, and coefficients (r, p) of combinations that are determined.
+        """Return one unknown for each determined direction, and coefficients (r, p) of what is determined.
 
         Each combination contains its own unknown with coefficient 1, and none of the other chosen ones.
         """

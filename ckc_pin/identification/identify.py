@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.summary import HasSummary, Row, Summary
+from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import LinearFit, fit_linear
 from ckc_pin.identification.measured_motion import MeasuredMotion, estimate_motion, fit_spline
@@ -25,7 +27,10 @@ from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import INERTIA_ENTRIES
 
-__all__ = ["Estimate", "Identification", "Residual", "identify", "identify_file"]
+if TYPE_CHECKING:
+    from ckc_pin.view.inline import Figures
+
+__all__ = ["Combination", "Estimate", "Identification", "Prediction", "Residual", "identify", "identify_file"]
 
 MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
 IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE = "identified", "only in a combination", "not identifiable"
@@ -90,6 +95,26 @@ class Residual:
     autocorrelation: float
 
 
+@dataclass(frozen=True, eq=False)
+class Prediction(Immutable):
+    """Measured and predicted torques along one record.
+
+    Attributes
+    ----------
+    source : str
+    validation : bool
+    t : (m,) array
+        s.
+    measured, predicted : (m, motors) arrays
+    """
+
+    source: str
+    validation: bool
+    t: Array
+    measured: Array
+    predicted: Array
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(HasSummary):
     """Parameters of a mechanism that measured torques determine.
@@ -109,10 +134,12 @@ class Identification(HasSummary):
         Whether the inertias are those of bodies that can exist.
     values : mapping of str to float
         A complete set of parameter values: measured ones, and for the rest those closest to the start values.
+    covariance : (k, k) array
+        Of the k parameters that are identified, in their order.
     instants : int
     warnings : tuple of str
-    measured, predicted : mapping of str to arrays
-        By record and ``tau.MOTOR``, for figures; ``t`` beside them.
+    motions : tuple of Prediction
+        Measured and predicted torques of each record.
     """
 
     mechanism: Mechanism
@@ -123,10 +150,51 @@ class Identification(HasSummary):
     validation: Mapping[str, Residual]
     physical: bool
     values: Mapping[str, float]
+    covariance: Array
     instants: int
     warnings: tuple[str, ...]
-    measured: Mapping[str, Mapping[str, Array]]
-    predicted: Mapping[str, Mapping[str, Array]]
+    motions: tuple[Prediction, ...]
+
+    @property
+    def identified(self) -> list[str]:
+        """Names of the parameters that the data determine."""
+        return [name for name, x in self.parameters.items() if x.verdict == IDENTIFIED]
+
+    def plot(self) -> Figures:
+        """Draw measured and predicted torques, residuals, and the correlation of the parameters."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a complete set of parameter values as the table ``[parameters]`` of a scene (TOML).
+
+        Raises
+        ------
+        InputError
+            The file cannot be written, or the inertias were not required to be physical.
+        """
+        require_path(path, "Identification.save: path")
+        if not self.values:
+            raise InputError(
+                "Identification.save: only physical parameters are a mechanism; identify with physical = true"
+            )
+        lines = [
+            f"# Parameters of {self.mechanism.name} from {self.instants} instants of measured torques.",
+            "# A line without a standard deviation is no measurement: the value is the one closest to the start value.",
+            "[parameters]",
+        ]
+        offsets = [name for name in self.values if name.endswith(".offset")]
+        for name, value in self.values.items():
+            if name not in offsets:
+                estimate = self.parameters[name]
+                note = f"  # std {estimate.std:.3g}" if estimate.std is not None else f"  # {estimate.verdict}"
+                lines.append(f'"{name}" = {value!r}{note}')
+        lines += [
+            f"# {name} = {self.values[name]!r}, of the measurement, no parameter of the mechanism" for name in offsets
+        ]
+        write_atomic(Path(path), "\n".join(lines) + "\n")
+        return Path(path)
 
     def summary(self) -> Summary:
         """Return what was identified, with standard deviations, and the residuals."""
@@ -172,8 +240,9 @@ def identify(
 ) -> Identification:
     """Estimate parameters from measured coordinates and motor torques.
 
-    Eq. 1 along the motions that the loops allow is linear in inertias, friction, damping, rotor inertias, stiffnesses and
-    offsets. The other coordinates, rates and accelerations follow from the loops and from splines of the measurements.
+    Eq. 1 along the motions that the loops allow is linear in inertias, friction, damping, rotor inertias, stiffnesses
+    and offsets. The other coordinates, rates and accelerations follow from the loops and from splines of what was
+    measured.
 
     Parameters
     ----------
@@ -194,8 +263,8 @@ def identify(
     Raises
     ------
     InputError
-        Missing quantities, fewer data than unknowns, parameters in which torques are not linear, or measurements that the
-        mechanism cannot follow.
+        Missing quantities, fewer data than unknowns, parameters in which torques are not linear, or measurements that
+        the mechanism cannot follow.
     """
     mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
     records = [
@@ -208,7 +277,7 @@ def identify(
 
 def identify_file(path: str | Path) -> Identification:
     """Run the identification that a file describes (InputError)."""
-    spec, sources = read_identify(path)
+    spec, _ = read_identify(path)
     mechanism, records = load_task(spec, Path(path).parent)
     estimate = spec.estimate
     return _identify(mechanism, records, estimate.parameters, physical=estimate.physical, robust=estimate.robust)
@@ -261,7 +330,8 @@ def _identify(
         columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
         if right.size < columns.shape[2]:
             raise InputError(
-                f"identify: {right.size} equations for {columns.shape[2]} unknowns; record a longer motion or estimate less"
+                f"identify: {right.size} equations for {columns.shape[2]} unknowns; record a longer motion or estimate "
+                "less"
             )
         fit = fit_linear(columns, right, robust=robust)
         step = fit.x
@@ -278,8 +348,8 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     if len(names) < mechanism.d or missing:
         wanted = missing or list(mechanism.independent)
         raise InputError(
-            f"identify: {record.source}: no column {', '.join(wanted)}; {mechanism.d} coordinates and the torque of every "
-            f"motor are needed, there are {', '.join(record.values) or 'none'}"
+            f"identify: {record.source}: no column {', '.join(wanted)}; {mechanism.d} coordinates and the torque of "
+            f"every motor are needed, there are {', '.join(record.values) or 'none'}"
         )
     _require_radians(mechanism, record, names)
     fits = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in names}
@@ -334,7 +404,7 @@ def _physical_step(regressor: TorqueRegressor, fit: LinearFit) -> Array:
         regressor.scale,
         bodies,
         np.array(positive, dtype=np.intp),
-    )
+    )  # fmt: skip
 
 
 def _result(
@@ -347,31 +417,35 @@ def _result(
     determined = fit.determined
     estimates: dict[str, Estimate] = {}
     values: dict[str, float] = {}
+    known: list[Array] = []
     for name, value, start, gradient in _parameters(regressor, unknowns):
         inside = determined @ (determined.T @ (gradient * scale))
         outside = np.linalg.norm(gradient * scale - inside)
         whole = max(float(np.linalg.norm(gradient * scale)), 1e-300)
         values[name] = value
         if outside <= LEAK_TOLERANCE * whole:
-            std = float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
+            std = max(float(gradient @ covariance @ gradient), 0.0) ** 0.5
             estimates[name] = Estimate(value, std, start, IDENTIFIED)
+            known.append(gradient)
         else:
             verdict = IN_COMBINATION if np.linalg.norm(inside) > LEAK_TOLERANCE * whole else NOT_IDENTIFIABLE
             estimates[name] = Estimate(None, None, start, verdict)
-    residuals = _residuals([x for x in equations if not x.record.validation], step, fit)
-    validation = _residuals([x for x in equations if x.record.validation], step, fit)
-    measured = {x.record.source: {"t": x.motion.t, **_by_motor(mechanism, x.tau)} for x in equations}
-    predicted = {
-        x.record.source: _by_motor(mechanism, x.tau - _torque_residual(x, step)) for x in equations
-    }  # fmt: skip
+    gradients = np.reshape(known, (len(known), len(names)))
+    residuals = _residuals([x for x in equations if not x.record.validation], mechanism.motors.names, step, fit)
+    validation = _residuals([x for x in equations if x.record.validation], mechanism.motors.names, step, fit)
+    motions = tuple(
+        Prediction(x.record.source, x.record.validation, x.motion.t, x.tau, x.tau - _torque_residual(x, step))
+        for x in equations
+    )
     is_physical = all(
         np.linalg.eigvalsh(pseudo_inertia(unknowns[[names.index(f"link.{link}.{k}") for k in MOMENTS]]))[0] > 0
         for link in regressor.links
     )
     return Identification(
         mechanism, estimates, _combinations(names, fit, step, regressor), fit.condition, residuals, validation,
-        is_physical, values if physical else {}, sum(len(x.right) for x in equations if not x.record.validation),
-        tuple(warnings), measured, predicted,
+        is_physical, values if physical else {}, gradients @ covariance @ gradients.T,
+        sum(len(x.right) for x in equations if not x.record.validation),
+        tuple(warnings), motions,
     )  # fmt: skip
 
 
@@ -418,7 +492,7 @@ def _combinations(
     for k, row in zip(chosen, coefficients, strict=True):
         own = row / scale * scale[k]  # in SI units, 1 for the chosen unknown
         std = float(np.sqrt(row @ fit.covariance @ row)) * scale[k]
-        terms = sorted((i for i in np.flatnonzero(own)), key=lambda i: i != k)
+        terms = [int(k), *(int(i) for i in np.flatnonzero(own) if i != k)]
         text = " ".join(_term(float(own[i]), names[i], first=not number) for number, i in enumerate(terms))
         value = float(own @ (regressor.start + scale * step))
         found.append(Combination(text, {names[i]: float(own[i]) for i in terms}, value, std))
@@ -436,30 +510,29 @@ def _torque_residual(equations: _Equations, step: Array) -> Array:
     return np.einsum("kmd,kd->km", equations.to_motors, equations.right - equations.columns @ step)
 
 
-def _by_motor(mechanism: Mechanism, tau: Array) -> dict[str, Array]:
-    return {f"tau.{name}": column for name, column in zip(mechanism.motors.names, tau.T, strict=True)}
-
-
-def _residuals(equations: Sequence[_Equations], step: Array, fit: LinearFit) -> dict[str, Residual]:
+def _residuals(
+    equations: Sequence[_Equations], motors: Sequence[str], step: Array, fit: LinearFit
+) -> dict[str, Residual]:
     residuals = {}
-    for k, name in enumerate(equations[0].record.values and _torque_names(equations[0]) if equations else ()):
+    for k, name in enumerate(f"tau.{motor}" for motor in (motors if equations else ())):
         parts = [_torque_residual(x, step)[:, k] for x in equations]
-        joined = np.concatenate(parts)
-        power = float(np.sum(joined**2))
-        neighbours = sum(float(np.sum(x[1:] * x[:-1])) for x in parts)
-        expected = [x.record.noise.get(name) for x in equations]
-        covariance = [x.to_motors @ fit.noise @ x.to_motors.swapaxes(1, 2) for x in equations]
-        estimated = float(np.sqrt(np.mean(np.concatenate([x[:, k, k] for x in covariance]))))
-        residuals[name] = Residual(
-            float(np.sqrt(np.mean(joined**2))),
-            estimated if None in expected else float(np.sqrt(np.mean(np.square([x or 0.0 for x in expected])))),
-            neighbours / power if power > 0 else 0.0,
-        )
+        power = float(sum(np.sum(x**2) for x in parts))
+        neighbours = float(sum(np.sum(x[1:] * x[:-1]) for x in parts))
+        count = sum(map(len, parts))
+        variances = [_expected_variance(x, k, name, fit) for x in equations]
+        expected = np.sqrt(sum(len(x) * variance for x, variance in zip(parts, variances, strict=True)) / count)
+        correlation = neighbours / power if power > 0 else 0.0
+        residuals[name] = Residual(float(np.sqrt(power / count)), float(expected), correlation)
     return residuals
 
 
-def _torque_names(equations: _Equations) -> list[str]:
-    return [name for name in equations.record.values if name.startswith("tau.")]
+def _expected_variance(equations: _Equations, k: int, name: str, fit: LinearFit) -> float:
+    """Return the variance of a motor's torque residual: as given, or as the fit estimated it."""
+    given = equations.record.noise.get(name)
+    if given is not None:
+        return given**2
+    to_motor = equations.to_motors[:, k]
+    return float(np.mean(np.einsum("kd,de,ke->k", to_motor, fit.noise, to_motor)))
 
 
 def _describe(name: str, estimate: Estimate) -> str:

@@ -1,8 +1,8 @@
 """Configurations, rates and accelerations of the whole tree from measured coordinates.
 
 Each measured coordinate is fitted by a spline of degree five, whose number of knots is chosen by generalized
-cross-validation. The loops then give all coordinates: at each instant the configuration on the constraint manifold that is
-nearest to the splines, weighted by their noise. Rates and accelerations follow in the same sense.
+cross-validation. The loops then give all coordinates: at each instant the configuration on the constraint manifold
+that is nearest to the splines, weighted by their noise. Rates and accelerations follow in the same sense.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ MAX_ITERATIONS, MAX_START_STEPS = 20, 40
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
 DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
 OFF_BRANCH = (
-    "identify: the loops do not let the mechanism follow the measured coordinates; they are of another branch or another "
-    "mechanism, or in other units"
+    "identify: the loops do not let the mechanism follow the measured coordinates; they are of another branch or "
+    "another mechanism, or in other units"
 )
 FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
 
@@ -98,8 +98,6 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     InputError
         Fewer than twelve measurements.
     """
-    from scipy.interpolate import make_lsq_spline
-
     known = np.isfinite(y)
     t, y = t[known], y[known]
     if len(t) < 2 * (DEGREE + 1):
@@ -107,10 +105,7 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     best: tuple[float, Any, int] | None = None
     count, worse = 2.0, 0
     while DEGREE + count <= len(t) / MIN_SAMPLES_PER_KNOT or best is None:
-        inner = np.quantile(t, np.linspace(0, 1, int(count) + 1)[1:-1])
-        knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
-        spline = make_lsq_spline(t, y, knots, k=DEGREE)
-        size = len(knots) - DEGREE - 1
+        spline, size = _least_squares(t, y, int(count))
         score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
         worse = 0 if best is None or score < best[0] else worse + 1
         if not worse:
@@ -124,6 +119,15 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
         noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
     interval = (t[-1] - t[0]) / (size - DEGREE)
     return SplineFit(spline, noise, noise * _spline_std(spline, t), float(interval))
+
+
+def _least_squares(t: Array, y: Array, intervals: int) -> tuple[Any, int]:
+    """Return the spline whose knot intervals have equally many measurements, and its number of coefficients."""
+    from scipy.interpolate import make_lsq_spline
+
+    inner = np.quantile(t, np.linspace(0, 1, intervals + 1)[1:-1])
+    knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
+    return make_lsq_spline(t, y, knots, k=DEGREE), intervals + DEGREE
 
 
 def _spline_std(spline: Any, t: Array) -> Array:
@@ -268,7 +272,7 @@ class _Nearest:
         raise InputError(OFF_BRANCH)
 
     def rates(self, q_tree: Array, rates: Array, accelerations: Array) -> tuple[Array, Array, Array]:
-        """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates from those of the measured ones."""
+        """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates."""
         tree = self.mechanism.tree
         phi, rho, phi_z = self._terms(q_tree)
         v_tree = np.einsum("knd,kd->kn", rho, self._independent_part(rho, rates))
@@ -299,7 +303,7 @@ class _Nearest:
         return phi, rho, phi_z
 
     def _independent_part(self, rho: Array, measured: Array) -> Array:
-        """Return the weighted least-squares solution q_dot (m, d) of rho q_dot = measured in the measured coordinates."""
+        """Return the least-squares solution q_dot (m, d) of rho q_dot = measured in the measured coordinates."""
         rows = rho[:, self.at] / self.noise[:, None]
         return np.einsum("kdi,ki->kd", np.linalg.pinv(rows), measured / self.noise)
 
@@ -309,6 +313,6 @@ class _Nearest:
         worst = int(np.argmax(ratio))
         if off[worst] > 1e-6 and ratio[worst] > FOLLOW_FACTOR:
             raise InputError(
-                f"identify: {names[worst]} is {off[worst]:.3g} off the constraint manifold, {ratio[worst]:.0f} times its "
-                "noise; the lengths differ from the mechanism's (calibrate them first), or a reading has an offset"
+                f"identify: {names[worst]} is {off[worst]:.3g} off the constraint manifold, {ratio[worst]:.0f} times "
+                "its noise; the lengths differ from the mechanism's (calibrate them first), or a reading has an offset"
             )

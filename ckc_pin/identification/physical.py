@@ -1,7 +1,7 @@
 """Inertias that some body can have, nearest to measured combinations and to a prior.
 
-The pseudo-inertia P of every link stays positive definite. What the measurements leave open is as close to the prior P_0 as
-possible, in a distance that depends on neither frame nor unit (Lee, Wensing, Park: Geometric robot dynamic
+The pseudo-inertia P of every link stays positive definite. What the measurements leave open is as close to the prior
+P_0 as possible, in a distance that depends on neither frame nor unit (Lee, Wensing, Park: Geometric robot dynamic
 identification, IEEE Transactions on Robotics 36 (2020)): the Bregman divergence of the log-determinant,
 
     d(P, P_0) = tr(P_0^-1 P) - log det(P_0^-1 P) - 4.

@@ -97,8 +97,8 @@ def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, f
         missing = next((name for name in names if name not in (*values, "t")), None)
         if missing is not None:
             raise InputError(
-                f"{source}: {what}: {missing}: no such quantity{suggest_name(missing, list(values))}; the columns of this "
-                f"mechanism are {', '.join(values)}"
+                f"{source}: {what}: {missing}: no such quantity{suggest_name(missing, list(values))}; the columns of "
+                f"this mechanism are {', '.join(values)}"
             )
     for name, x in values.items():
         if x.shape != t.shape:

@@ -2,8 +2,8 @@
 
     rho^T (Y(q', v', a') p - G^T tau) = 0,
 
-with the multipliers of the loops eliminated by J rho = 0. Y has a column for each unknown: ten for the inertia of a link
-(mass, first moment, inertia about the link's origin), one for the friction or damping of a joint, the inertia of a
+with the multipliers of the loops eliminated by J rho = 0. Y has a column for each unknown: ten for the inertia of a
+link (mass, first moment, inertia about the link's origin), one for the friction or damping of a joint, the inertia of a
 rotor, a stiffness, a constant force, or the offset of a motor's torque measurement.
 """
 
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -47,8 +48,8 @@ class Unknown(Immutable):
     scale : float
         A typical size, to compare numbers of different units.
     slopes : mapping of str to array
-        Derivatives of the numbers of `model_numbers`, of the friction (n,), of the offsets of motors (motors,), and of the
-        dynamic parameters of bodies, ``body`` (joints - 1, 10).
+        Derivatives of the numbers of `model_numbers`, of the friction (n,), of the offsets of motors (motors,), and
+        of the dynamic parameters of bodies, ``body`` (joints - 1, 10).
     """
 
     name: str
@@ -114,7 +115,7 @@ class TorqueRegressor:
                 of_tree = pin.computeJointTorqueRegressor(
                     tree.model, tree.data, motion.q_tree[k], motion.v_tree[k], motion.a_tree[k]
                 )
-                of_bodies[k] = motion.rho[k].T @ of_tree
+                of_bodies[k] = motion.rho[k].T @ of_tree.reshape(tree.n, -1)  # a matrix of one row becomes a vector
         if springs.any or springs.joint_damping.any():
             for k in range(count):
                 force[k] -= springs.elastic_force(motion.q_tree[k])
@@ -155,9 +156,7 @@ class TorqueRegressor:
             springs.joint_stiffness, springs.joint_damping, springs.constant = np.zeros((3, self.mechanism.n))
             springs.stiffness = springs.damping = np.zeros(len(springs.names))
             setattr(springs, key, slope)
-            forces.append(
-                (lambda q, _, of=springs: of.elastic_force(q)) if key == "stiffness" else springs.damping_force
-            )
+            forces.append(partial(_elastic_force, springs) if key == "stiffness" else springs.damping_force)
         return forces
 
     def _unknowns(self, name: str) -> Iterator[Unknown]:
@@ -217,7 +216,7 @@ def link_moments(parameters: ParameterMap, link: str) -> Array:
 
 
 def _dynamic_parameters(slopes: Mapping[str, Array], joint: int) -> Array:
-    """Return the derivatives of the ten numbers of a body, from those of its mass, moment and inertia about its origin."""
+    """Return the derivatives of a body's ten numbers, from those of its mass, moment and inertia about its origin."""
     inertia = slopes["origin_inertia"][joint]
     return np.array([slopes["mass"][joint], *slopes["moment"][joint], inertia[0, 0], inertia[0, 1], inertia[1, 1],
                      inertia[0, 2], inertia[1, 2], inertia[2, 2]])  # fmt: skip
@@ -236,8 +235,8 @@ def expand_names(mechanism: Mechanism, parameters: ParameterMap, patterns: Seque
         if not any(fnmatchcase(name, pattern) for name in names):
             kinds = sorted({".".join((name.split(".")[0], "*", name.split(".", 2)[2])) for name in names})
             raise InputError(
-                f"identify: parameters: nothing is called {pattern!r}{suggest_name(pattern, names)}; torques are linear in "
-                f"{', '.join(kinds)}"
+                f"identify: parameters: nothing is called {pattern!r}{suggest_name(pattern, names)}; torques are "
+                f"linear in {', '.join(kinds)}"
             )
     chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
     whole = {name.split(".")[1] for name in chosen if name.endswith(f".{INERTIAL}")}

@@ -126,6 +126,7 @@ def read_identify(path: str | Path) -> tuple[IdentifySpec, Sources]:
         for quantity, unit in entry.units.items():
             if unit not in UNITS:
                 raise InputError(
-                    f"{sources.name}: data: {entry.file}: units: {quantity}: no unit {unit!r}; there are {', '.join(UNITS)}"
+                    f"{sources.name}: data: {entry.file}: units: {quantity}: no unit {unit!r}; there are "
+                    f"{', '.join(UNITS)}"
                 )
     return spec, sources

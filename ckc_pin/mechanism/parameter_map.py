@@ -22,7 +22,14 @@ from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, Value, split_component
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.spec import FrameSpec, MechanismSpec
 
-__all__ = ["ParameterMap", "inertial_rotation", "list_line_springs", "list_loop_frames", "list_spring_ends", "model_numbers"]
+__all__ = [
+    "ParameterMap",
+    "inertial_rotation",
+    "list_line_springs",
+    "list_loop_frames",
+    "list_spring_ends",
+    "model_numbers",
+]
 
 Numbers = NDArray[Any]  # real, or complex for a derivative
 
@@ -440,6 +447,7 @@ def _rpy_matrix(rpy: Numbers) -> Numbers:
 
 
 def inertial_rotation(inertial: ElementTree.Element) -> Array:
+    """Return the axes of a link's inertial frame in the link's frame, shape (3, 3)."""
     origin = inertial.find("origin")
     return _rpy_matrix(
         np.array([float(x) for x in ("0 0 0" if origin is None else origin.get("rpy", "0 0 0")).split()])
