@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,69 @@ settings.load_profile("ckc_pin")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# The files that take longest, of the seconds of all tests about half. They are begun first, so that all workers end at
+# about the same time.
+SLOW_FILES = (
+    "docs/test_site.py",
+    "browser/test_explore_by_hand.py",
+    "ensembles/test_sweep.py",
+    "contract/test_cli_signals.py",
+    "docs/test_snippets.py",
+    "browser/test_player.py",
+    "sensitivity/test_couplings.py",
+    "browser/test_explore_page.py",
+    "browser/test_explore_connection.py",
+    "sensitivity/test_named_parameters.py",
+    "sensitivity/test_compiled_terms.py",
+    "contract/test_experiments.py",
+    "browser/test_playback.py",
+    "contract/test_report_command.py",
+    "fuzz/test_fuzz.py",
+    "browser/test_explore_dragging.py",
+    "sensitivity/test_control.py",
+    "analytic/test_map.py",
+    "property/test_dynamics.py",
+    "codegen/test_far_masses.py",
+    "codegen/test_compiled.py",
+    "analytic/test_derivatives.py",
+    "examples/test_examples.py",
+    "ensembles/test_interrupt.py",
+    "contract/test_map_command.py",
+    "contract/test_figures.py",
+    "analytic/test_sections.py",
+    "explorer/test_branches.py",
+    "analysis/test_work_precision.py",
+    "regression/test_ivp.py",
+    "analytic/test_prescribed.py",
+)
+
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
 
 Pair = tuple[Mechanism, FiveBar]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the order of files; pytest-xdist would begin with the files that have most tests."""
+    config.option.loadscopereorder = False
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, but not among the tests, which would take a quarter of the time to collect them."""
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.hookimpl(wrapper=True, optionalhook=True)
+def pytest_xdist_auto_num_workers() -> Generator[None, int, int]:
+    """Use one worker more than there are cores, because many tests wait for a browser or another process."""
+    return (yield) + 1
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slow files."""
+    place = {Path(__file__).parent / file: k for k, file in enumerate(SLOW_FILES)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = False) -> None:

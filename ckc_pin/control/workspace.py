@@ -6,9 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.control.desired import Desired, count_cycles
 from ckc_pin.errors import NumericalError
+from ckc_pin.kinematics.continuation import is_local
+from ckc_pin.kinematics.extended import Task, extend_closure
+from ckc_pin.kinematics.nodes import follow, nodes_at
 from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.batch import difference_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -19,6 +24,8 @@ SAMPLES_PER_CYCLE = 32  # of the fastest wave: linear interpolation between them
 MAX_SAMPLES = 10_000  # some seconds of computing time
 POSITION_TOLERANCE = 1e-6  # rad, m, and relative: of the position after a turn
 MAX_MINIMA = 5  # local minima of the singular value that are refined
+BLOCK = 32  # samples that are computed together
+SAFE_FRACTION = 0.1  # of the assembled singular value: samples below it are followed one by one
 BISECTIONS = 50  # to 1e-15 of a sample interval
 
 Sample = tuple[float, float, Kinematics]  # time, smallest singular value of phi_z, configuration
@@ -91,15 +98,51 @@ def _follow(
     first = sigma(mechanism, desired(0.0)[0], start)
     if first.verdict != "converged":
         return DesiredCheck(0.0, 0.0, 0.0, 0.0), False
-    at, t_at = first.at, 0.0
-    path = [(0.0, at.sigma_min(), at)]
-    for t in times[1:]:
-        moved = _move(mechanism, at, desired, float(t))
-        if moved is None:
-            return find_workspace_exit(mechanism, desired, at, t_at, float(t)), False
-        at, t_at = moved, float(t)
-        path.append((t_at, at.sigma_min(), at))
-    return _find_closest(mechanism, desired, path), _is_same_position(mechanism, path[0][2], at)
+    path = [(0.0, first.at.sigma_min(), first.at)]
+    extended = extend_closure(mechanism)
+    task = Task(extended, extended.joints)
+    for begin in range(1, len(times), BLOCK):
+        block = times[begin : begin + BLOCK]
+        samples_of_block = _move_together(task, path[-1][2], desired, block)
+        if samples_of_block is not None:
+            path += samples_of_block
+            continue
+        for t in block.tolist():
+            t_at, _, at = path[-1]
+            moved = _move(mechanism, at, desired, t)
+            if moved is None:
+                return find_workspace_exit(mechanism, desired, at, t_at, t), False
+            path.append((t, moved.sigma_min(), moved))
+    return _find_closest(mechanism, desired, path), _is_same_position(mechanism, path[0][2], path[-1][2])
+
+
+def _move_together(task: Task, at: Kinematics, desired: Desired, times: Array) -> list[Sample] | None:
+    """Move from a configuration to the samples at some times, all at once.
+
+    Each sample is reached along the straight line in q. None means that the samples have to be followed one by one:
+    one is not reached, is nearly singular, or is far from the sample before it, as on another branch.
+    """
+    mechanism, z = task.extended.mechanism, at.partition.z
+    if not len(z) or len(task.rows) < mechanism.d:  # q of a free root has no rows
+        return None
+    try:
+        q = np.array([desired(t)[0] for t in times.tolist()])
+    except NumericalError:
+        return None
+    start = nodes_at(task, at.q_tree[None])[np.zeros(len(times), np.intp)]
+    nodes, arrived = follow(task, start, q - start.values)
+    steps = difference_many(mechanism.tree, np.vstack([at.q_tree, nodes.q_tree[:-1]]), nodes.q_tree)
+    if not np.all(arrived & is_local(mechanism.tree, steps)):
+        return None
+    values = np.linalg.svd(nodes.J[:, task.extended.loops][:, :, z], compute_uv=False)[:, len(z) - 1]
+    if not values.min() > SAFE_FRACTION * mechanism.assembled.sigma_min():
+        return None
+    configurations = [Kinematics(at.tree, at.closure, at.partition, q_tree) for q_tree in nodes.q_tree]
+    last = _move(mechanism, configurations[-1], desired, float(times[-1]), anywhere=False)  # closed to rounding
+    if last is None:
+        return None
+    configurations[-1] = last
+    return list(zip(times.tolist(), values.tolist(), configurations, strict=True))
 
 
 def _is_same_position(mechanism: Mechanism, one: Kinematics, other: Kinematics) -> bool:

@@ -16,7 +16,7 @@ from ckc_pin.ensembles.spec import parse_sweep
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.view.ensemble_figures import draw_basins, draw_quantiles, draw_sobol_indices
 from ckc_pin.view.layout import write_figure
-from scripts.experiments.certificate.certificate import certify, rest_height, sublevel_set
+from scripts.experiments.certificate.certificate import DIVISIONS, certify, rest_height, sublevel_set
 from scripts.experiments.chart import shrink
 from scripts.experiments.paper.set_point_experiments import load_case
 
@@ -67,10 +67,10 @@ def tolerances(out: Path, members: int, weighed_by: int) -> str:
     return "\n".join(lines)
 
 
-def basin(out: Path, count: int) -> str:
+def basin(out: Path, count: int, divisions: int) -> str:
     """Start at rest from a lattice of angles and compare the basin of attraction with the certified set."""
     case = load_case({"formulation": "reduced"})
-    proved = certify(case.mechanism, case.controller, case.start)
+    proved = certify(case.mechanism, case.controller, case.start, divisions)
     grid = {"grid": {"start": LATTICE[0], "stop": LATTICE[1], "count": count}}
     names = ("initial.q.theta_1", "initial.q.theta_3")
     data_set = ckc_pin.ensemble(
@@ -81,7 +81,7 @@ def basin(out: Path, count: int) -> str:
         data_set[name].attrs["units"] = "rad"
     starts = np.column_stack([data_set[name].to_numpy() for name in names])
     home = (data_set["settled"].to_numpy() == 1.0) & (data_set["status"].to_numpy() == 1)
-    inside = _proved(case, proved.safe_level, starts)
+    inside = _proved(case, proved.safe_level, divisions, starts)
     map_ = ckc_pin.singularity_map("five_bar")
     q = case.mechanism.partition.q
     curves = [_wrap_angles(locus.q_tree[:, q]) for locus in map_.loci if locus.kind != "serial"]
@@ -100,9 +100,9 @@ def basin(out: Path, count: int) -> str:
     )
 
 
-def _proved(case: Any, level: float, starts: Array) -> BoolArray:
+def _proved(case: Any, level: float, divisions: int, starts: Array) -> BoolArray:
     """Return which starts are in the part of {U <= level} around q_d, by the certificate's lattice."""
-    region = sublevel_set(case.mechanism, case.controller, level)
+    region = sublevel_set(case.mechanism, case.controller, level, divisions)
     nodes = np.array([case.mechanism.independent_part(at.q_tree) for at in region.explored.nodes])
     inside = np.zeros(len(starts), bool)
     for k, q in enumerate(starts):
@@ -135,6 +135,6 @@ def main(out: Path, quick: bool = False) -> None:
     out.mkdir(parents=True, exist_ok=True)
     lengths = tolerances(out, *((16, 4) if quick else (512, 64)))
     print(f"Lengths wrong by {DEVIATION * 1e3:g} mm (standard deviation)\n\n{lengths}\n")
-    print(f"Set-point control from everywhere\n\n{basin(out, 9 if quick else 41)}")
+    print(f"Set-point control from everywhere\n\n{basin(out, *((9, 15) if quick else (41, DIVISIONS)))}")
     for figure in out.glob("*.png"):
         shrink(figure)

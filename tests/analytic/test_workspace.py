@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from ckc_pin import load
+from ckc_pin import Tracking, load, load_scene
+from ckc_pin.control import workspace
 from ckc_pin.control.desired import Desired, Harmonics, Table, count_cycles
 from ckc_pin.control.spec import MotionSpec
 from ckc_pin.control.workspace import follow_desired
+from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from tests.analytic.five_bar import FIVE_BAR
 
 EDGE = float(
@@ -26,6 +28,20 @@ def test_fast_desired_motions_are_seen_to_leave_the_workspace(turns: float) -> N
     result = follow_desired(load("five_bar"), opposite_swings(1.002 * EDGE, w), 1.0)
     assert result.leaves_at == pytest.approx(np.arcsin(1 / 1.002) / w, rel=1e-9)
     assert result.until == result.leaves_at
+
+
+@pytest.mark.parametrize("scene", ["five_bar/tracking", "five_bar_as_printed/tracking", "delta/circle", "two_ur5/lift"])
+def test_samples_computed_together_are_those_followed_one_by_one(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_scene(scene)
+    mechanism = load_scene_mechanism(loaded)
+    controller = build_scene_controller(loaded, mechanism)
+    assert isinstance(controller, Tracking)
+    together = follow_desired(mechanism, controller.desired, loaded.spec.t_end)
+    monkeypatch.setattr(workspace, "_move_together", lambda *arguments: None)
+    single = follow_desired(mechanism, controller.desired, loaded.spec.t_end)
+    assert together.leaves_at == single.leaves_at
+    assert together.until == single.until
+    assert together.sigma_min == pytest.approx(single.sigma_min, rel=1e-11)
 
 
 def test_check_reports_how_far_a_very_fast_motion_was_followed() -> None:

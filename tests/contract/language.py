@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["BOUNDS", "NAMES", "PHRASES", "Hit", "bounds", "check_name", "check_prose", "count", "hits", "main"]
+__all__ = ["BOUNDS", "NAMES", "PHRASES", "Hit", "bounds", "check_name", "check_prose", "count", "hits", "main", "rooms"]
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUNDS = Path(__file__).with_name("language_bounds.toml")
@@ -182,11 +182,11 @@ def check_prose(text: str) -> list[tuple[int, str, str]]:
 # --- Python ----------------------------------------------------------------------------------------
 
 
-def _bindings(tree: ast.Module) -> Iterator[tuple[int, str, bool, bool]]:
+def _bindings(tree: ast.Module, nodes: list[ast.AST]) -> Iterator[tuple[int, str, bool, bool]]:
     """Names that a module binds: (line, name, is a function or class, is a constant of the module)."""
-    top = {id(node) for statement in tree.body for node in ast.walk(statement)
-           if isinstance(statement, ast.Assign | ast.AnnAssign)}  # fmt: skip
-    for node in ast.walk(tree):
+    top = {id(node) for statement in tree.body if isinstance(statement, ast.Assign | ast.AnnAssign)
+           for node in ast.walk(statement)}  # fmt: skip
+    for node in nodes:
         match node:
             case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
                 yield node.lineno, name, True, False
@@ -196,14 +196,14 @@ def _bindings(tree: ast.Module) -> Iterator[tuple[int, str, bool, bool]]:
                 yield node.lineno, name, False, False
 
 
-def _python_prose(text: str, tree: ast.Module) -> Iterator[tuple[int, str]]:
+def _python_prose(text: str, nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
     """Comments and strings of a module, with their first lines; comments on consecutive lines are one."""
     inside_f = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.JoinedStr):
             inside_f |= {id(value) for value in node.values}
             yield node.lineno, "".join(str(v.value) if isinstance(v, ast.Constant) else "{}" for v in node.values)
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inside_f:
             yield node.lineno, node.value
     block, start, last = [], 0, -1
@@ -220,13 +220,14 @@ def _python_prose(text: str, tree: ast.Module) -> Iterator[tuple[int, str]]:
 def _python(file: str) -> Iterator[tuple[str, Hit]]:
     text = (ROOT / file).read_text(encoding="utf-8")
     tree = ast.parse(text)
-    names = list(_bindings(tree))
+    nodes = list(ast.walk(tree))
+    names = list(_bindings(tree, nodes))
     sides = any(name.strip("_").startswith("right") for _, name, _, _ in names)
     for line, name, function, constant in names:
         say = check_name(name, function, constant)
         if say and not (sides and name.strip("_").startswith("left")):
             yield "names", Hit(file, line, name, say)
-    for start, prose in _python_prose(text, tree):
+    for start, prose in _python_prose(text, nodes):
         for line, phrase, say in check_prose(prose):
             yield "phrases", Hit(file, start + line, phrase, say)
 
@@ -279,16 +280,28 @@ def _room(file: str) -> str:
 
 
 @cache
+def rooms() -> dict[str, list[str]]:
+    """Files of each room, without those of the vocabulary itself."""
+    paths = [path for top in TOPS for path in (ROOT / top).rglob("*")] + list(ROOT.glob("*.md"))
+    files = {path.relative_to(ROOT).as_posix() for path in paths if path.suffix in READERS} - set(THIS)
+    by_room: dict[str, list[str]] = {}
+    for file in sorted(files):
+        by_room.setdefault(_room(file), []).append(file)
+    return by_room
+
+
+@cache
 def hits() -> dict[str, dict[str, list[Hit]]]:
     """Names and phrases to avoid, by room and by what they are ("names", "phrases")."""
-    files = [path for top in TOPS for path in (ROOT / top).rglob("*")] + list(ROOT.glob("*.md"))
-    rooms: dict[str, dict[str, list[Hit]]] = {}
-    for file in sorted(path.relative_to(ROOT).as_posix() for path in files if path.suffix in READERS):
-        if file not in THIS:
-            room = rooms.setdefault(_room(file), {"names": [], "phrases": []})
-            for kind, hit in READERS[Path(file).suffix](file):
-                room[kind].append(hit)
-    return rooms
+    return {room: _hits_of(files) for room, files in rooms().items()}
+
+
+def _hits_of(files: list[str]) -> dict[str, list[Hit]]:
+    kinds: dict[str, list[Hit]] = {"names": [], "phrases": []}
+    for file in files:
+        for kind, hit in READERS[Path(file).suffix](file):
+            kinds[kind].append(hit)
+    return kinds
 
 
 def count() -> dict[str, dict[str, int]]:

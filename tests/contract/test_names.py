@@ -161,7 +161,7 @@ def test_vocabulary_finds_phrases_across_lines() -> None:
     assert language.check_prose("Close a loop by least squares near the equilibrium.") == []
 
 
-@pytest.mark.parametrize("room", sorted(language.count().keys() | language.bounds().keys()))
+@pytest.mark.parametrize("room", sorted(language.rooms().keys() | language.bounds().keys()))
 def test_room_has_exactly_the_bounded_number_of_names_and_phrases_to_avoid(room: str) -> None:
     """A room that is not in `language_bounds.toml` has none; a bound is lowered as soon as the count is."""
     counts = language.count().get(room, {"names": 0, "phrases": 0})

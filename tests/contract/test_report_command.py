@@ -13,7 +13,7 @@ import pytest
 
 from ckc_pin.cli import report as command
 from tests.analysis.swing_table import SCENE, pendulum, write_table
-from tests.contract.helpers.command import ckc
+from tests.contract.helpers.command import Outcome, ckc
 from tests.contract.helpers.under_way import under_way
 
 ANSWER = {"status", "message", "scenes", "written"}
@@ -28,6 +28,14 @@ ADVICE = {"target", "set", "remove", "reason", "wall_s", "error", "mujoco"}
 def table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return write_table(tmp_path / "table")
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """Return what `ckc report table` prints."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("printed"))
+        return ckc("report", write_table(Path("table")).name, "--budget", "5")
 
 
 @pytest.fixture
@@ -53,10 +61,9 @@ def test_json_of_a_users_scene(table: Path) -> None:
     assert [advice["target"] for advice in section["advice"]] == [1e-3, 1e-6, 1e-9]
 
 
-def test_advised_options_can_be_pasted_into_run(table: Path, no_mujoco: None) -> None:
+def test_advised_options_can_be_pasted_into_run(table: Path, no_mujoco: None, printed: Outcome) -> None:
     section = ckc("report", "table", "--budget", "5", "--json").json["scenes"][0]
-    printed = ckc("report", "table", "--budget", "5").out
-    assert "for an error of 1e-03: --set formulation=" in printed
+    assert "for an error of 1e-03: --set formulation=" in printed.out
     for advice in section["advice"][:2]:
         options = [word for option in advice["set"] for word in ("--set", option)]
         run = ckc("run", "table", *options, "--json").json
@@ -64,9 +71,8 @@ def test_advised_options_can_be_pasted_into_run(table: Path, no_mujoco: None) ->
         assert np.abs(np.array(run["q_tree"]) - q_tree[-1]).max() <= advice["target"]
 
 
-def test_terminal_output_has_table_notes_and_advice(table: Path) -> None:
-    answer = ckc("report", "table", "--budget", "5")
-    assert (answer.code, answer.err) == (0, "")
+def test_terminal_output_has_table_notes_and_advice(printed: Outcome) -> None:
+    assert (printed.code, printed.err) == (0, "")
     for words in (
         "shortest time (ms) within an error of",
         "reduced, auto",
@@ -75,8 +81,8 @@ def test_terminal_output_has_table_notes_and_advice(table: Path) -> None:
         "confirmed by",
         "loops are soft constraints in MuJoCo",
     ):
-        assert words in answer.out
-    assert max(map(len, answer.out.split("reference:")[0].splitlines())) <= 80
+        assert words in printed.out
+    assert max(map(len, printed.out.split("reference:")[0].splitlines())) <= 80
 
 
 def test_folder_has_page_rows_and_figures(table: Path) -> None:

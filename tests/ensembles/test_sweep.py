@@ -21,6 +21,7 @@ import pytest
 import xarray as xr
 
 import ckc_pin
+from ckc_pin.ensembles import cluster
 from ckc_pin.errors import InputError
 from tests.contract.helpers.command import ckc
 
@@ -47,6 +48,12 @@ def write_sweep(folder: Path, members: int = 40, t_end: float = 0.2, more: str =
     path = folder / "test.sweep.toml"
     path.write_text(FILE.format(members=members, t_end=t_end) + more)
     return path
+
+
+@pytest.fixture
+def quick_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for one second instead of ten for a scheduler that does not answer."""
+    monkeypatch.setattr(cluster, "SCHEDULER_TIMEOUT_S", 1.0)
 
 
 def open_results(out: Path) -> xr.Dataset:
@@ -212,7 +219,9 @@ def test_the_store_of_another_sweep_is_not_changed(tmp_path: Path) -> None:
         ('"zarr.json" = "t"\n', [], "'zarr.json' cannot be the name of an array"),
     ],
 )
-def test_wrong_input_gives_one_message(tmp_path: Path, more: str, options: list[str], message: str) -> None:
+def test_wrong_input_gives_one_message(
+    tmp_path: Path, quick_timeout: None, more: str, options: list[str], message: str
+) -> None:
     done = ckc("sweep", str(write_sweep(tmp_path, 3, more=more)), "--out", str(tmp_path / "o"), *options)
     assert done.code == 2
     assert message in done.err
@@ -220,7 +229,7 @@ def test_wrong_input_gives_one_message(tmp_path: Path, more: str, options: list[
     assert len(done.err.strip().splitlines()) == 1
 
 
-def test_a_scheduler_that_does_not_answer_is_not_used_later() -> None:
+def test_a_scheduler_that_does_not_answer_is_not_used_later(quick_timeout: None) -> None:
     arguments = ("five_bar/swing", {"initial.q.theta_1": [-1.4, -1.2]}, {"end": "q_tree"})
     keywords: dict[str, Any] = {"overrides": {"t_end": 0.01, "solver.terms": "pinocchio"}, "progress": False}
     for address in ("nonsense://x", "tcp://127.0.0.1:9"):
