@@ -346,9 +346,9 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     missing = [name for name in torques if name not in record.values]
     if len(names) < mechanism.d or missing:
-        wanted = missing or list(mechanism.independent)
+        columns = missing or list(mechanism.independent)
         raise InputError(
-            f"identify: {record.source}: no column {', '.join(wanted)}; {mechanism.d} coordinates and the torque of "
+            f"identify: {record.source}: no column {', '.join(columns)}; {mechanism.d} coordinates and the torque of "
             f"every motor are needed, there are {', '.join(record.values) or 'none'}"
         )
     _require_radians(mechanism, record, names)
@@ -417,7 +417,7 @@ def _result(
     determined = fit.determined
     estimates: dict[str, Estimate] = {}
     values: dict[str, float] = {}
-    known: list[Array] = []
+    slopes: list[Array] = []
     for name, value, start, gradient in _parameters(regressor, unknowns):
         inside = determined @ (determined.T @ (gradient * scale))
         outside = np.linalg.norm(gradient * scale - inside)
@@ -426,11 +426,11 @@ def _result(
         if outside <= LEAK_TOLERANCE * whole:
             std = max(float(gradient @ covariance @ gradient), 0.0) ** 0.5
             estimates[name] = Estimate(value, std, start, IDENTIFIED)
-            known.append(gradient)
+            slopes.append(gradient)
         else:
             verdict = IN_COMBINATION if np.linalg.norm(inside) > LEAK_TOLERANCE * whole else NOT_IDENTIFIABLE
             estimates[name] = Estimate(None, None, start, verdict)
-    gradients = np.reshape(known, (len(known), len(names)))
+    gradients = np.reshape(slopes, (len(slopes), len(names)))
     residuals = _residuals([x for x in equations if not x.record.validation], mechanism.motors.names, step, fit)
     validation = _residuals([x for x in equations if x.record.validation], mechanism.motors.names, step, fit)
     motions = tuple(
@@ -488,15 +488,15 @@ def _combinations(
     names: Sequence[str], fit: LinearFit, step: Array, regressor: TorqueRegressor
 ) -> tuple[Combination, ...]:
     chosen, coefficients = fit.combinations()
-    scale, found = regressor.scale, []
+    scale, combinations = regressor.scale, []
     for k, row in zip(chosen, coefficients, strict=True):
-        own = row / scale * scale[k]  # in SI units, 1 for the chosen unknown
+        factors = row / scale * scale[k]  # in SI units, 1 for the chosen unknown
         std = float(np.sqrt(row @ fit.covariance @ row)) * scale[k]
-        terms = [int(k), *(int(i) for i in np.flatnonzero(own) if i != k)]
-        text = " ".join(_term(float(own[i]), names[i], first=not number) for number, i in enumerate(terms))
-        value = float(own @ (regressor.start + scale * step))
-        found.append(Combination(text, {names[i]: float(own[i]) for i in terms}, value, std))
-    return tuple(found)
+        terms = [int(k), *(int(i) for i in np.flatnonzero(factors) if i != k)]
+        text = " ".join(_term(float(factors[i]), names[i], first=not number) for number, i in enumerate(terms))
+        value = float(factors @ (regressor.start + scale * step))
+        combinations.append(Combination(text, {names[i]: float(factors[i]) for i in terms}, value, std))
+    return tuple(combinations)
 
 
 def _term(coefficient: float, name: str, *, first: bool) -> str:
@@ -528,9 +528,9 @@ def _residuals(
 
 def _expected_variance(equations: _Equations, k: int, name: str, fit: LinearFit) -> float:
     """Return the variance of a motor's torque residual: as given, or as the fit estimated it."""
-    given = equations.record.noise.get(name)
-    if given is not None:
-        return given**2
+    std = equations.record.noise.get(name)
+    if std is not None:
+        return std**2
     to_motor = equations.to_motors[:, k]
     return float(np.mean(np.einsum("kd,de,ke->k", to_motor, fit.noise, to_motor)))
 

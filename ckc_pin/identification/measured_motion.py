@@ -98,8 +98,8 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     InputError
         Fewer than twelve measurements.
     """
-    known = np.isfinite(y)
-    t, y = t[known], y[known]
+    measured = np.isfinite(y)
+    t, y = t[measured], y[measured]
     if len(t) < 2 * (DEGREE + 1):
         raise InputError(f"identify: {len(t)} measurements of one quantity; at least {2 * (DEGREE + 1)} are needed")
     best: tuple[float, Any, int] | None = None

@@ -87,12 +87,12 @@ def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, f
         raise InputError(
             f"{source}: no column 't'; there are {', '.join(columns)}; names = {{t = \"COLUMN\"}} renames one"
         )
-    known = [*mechanism.coordinates, *(f"v.{name}" for name in mechanism.coordinates)]
-    known += [f"tau.{name}" for name in mechanism.motors.names]
+    quantities = [*mechanism.coordinates, *(f"v.{name}" for name in mechanism.coordinates)]
+    quantities += [f"tau.{name}" for name in mechanism.motors.names]
     factors = {name: UNITS[unit] for name, unit in spec.units.items()}
     t = np.asarray(columns["t"], dtype=float) * factors.get("t", 1.0)
     _require_increasing(t, source)
-    values = {name: x * factors.get(name, 1.0) for name, x in columns.items() if name in known}
+    values = {name: x * factors.get(name, 1.0) for name, x in columns.items() if name in quantities}
     for what, names in (("noise", spec.noise), ("units", spec.units), ("delay", spec.delay)):
         missing = next((name for name in names if name not in (*values, "t")), None)
         if missing is not None:

@@ -63,10 +63,10 @@ def _draw_torques(result: Identification) -> Figure:
     panels = figure.subplots(len(motors), sharex=True, squeeze=False)[:, 0]
     kind = "not fitted" if motion.validation else "fitted"
     figure.suptitle(f"{escape_mathtext(motion.source)}, {kind}", x=0.01, ha="left", fontweight="bold")
-    every = max(1, len(motion.t) // POINTS)
+    stride = max(1, len(motion.t) // POINTS)
     for ax, motor, measured, predicted in zip(panels, motors, motion.measured.T, motion.predicted.T, strict=True):
-        ax.plot(motion.t[::every], measured[::every], color=style.COLOURS[0], linewidth=0.8, label="measured")
-        ax.plot(motion.t[::every], predicted[::every], color=style.COLOURS[1], linewidth=1.2, label="predicted")
+        ax.plot(motion.t[::stride], measured[::stride], color=style.COLOURS[0], linewidth=0.8, label="measured")
+        ax.plot(motion.t[::stride], predicted[::stride], color=style.COLOURS[1], linewidth=1.2, label="predicted")
         ax.set_ylabel(f"{escape_mathtext(motor)} [N m]")
     panels[0].legend(loc="upper right", ncols=2, fontsize=8)
     panels[-1].set_xlabel("time [s]")
@@ -83,9 +83,9 @@ def _draw_residuals(result: Identification) -> Figure:
     for k, (motor, (over_time, correlation)) in enumerate(zip(motors, panels, strict=True)):
         for number, motion in enumerate(x for x in result.motions if not x.validation):
             residual = (motion.measured - motion.predicted)[:, k]
-            every = max(1, len(motion.t) // POINTS)
+            stride = max(1, len(motion.t) // POINTS)
             colour = style.COLOURS[number % len(style.COLOURS)]
-            over_time.plot(motion.t[::every], residual[::every], ".", markersize=1.5, color=colour)
+            over_time.plot(motion.t[::stride], residual[::stride], ".", markersize=1.5, color=colour)
             lags = np.arange(1, min(MAX_LAGS, len(residual) - 1))
             power = max(float(residual @ residual), 1e-300)
             correlation.plot(lags, [residual[lag:] @ residual[:-lag] / power for lag in lags], color=colour)
