@@ -268,8 +268,8 @@ def identify(
     """
     mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
     records = [
-        Record(x.source, x.t, x.values, {**(noise or {}), **x.noise}, x.delay, held_out)
-        for group, held_out in ((data, False), (validation, True))
+        Record(x.source, x.t, x.values, {**(noise or {}), **x.noise}, x.delay, for_validation)
+        for group, for_validation in ((data, False), (validation, True))
         for x in (read_record(part, mechanism) for part in _as_list(group))
     ]
     return _identify(mechanism, records, parameters, physical=physical, robust=robust)
@@ -346,9 +346,9 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     missing = [name for name in torques if name not in record.values]
     if len(names) < mechanism.d or missing:
-        columns = missing or list(mechanism.independent)
+        required = missing or list(mechanism.independent)
         raise InputError(
-            f"identify: {record.source}: no column {', '.join(columns)}; {mechanism.d} coordinates and the torque of "
+            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torque of "
             f"every motor are needed, there are {', '.join(record.values) or 'none'}"
         )
     _require_radians(mechanism, record, names)
