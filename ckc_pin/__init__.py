@@ -48,7 +48,8 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
-    from ckc_pin.identification.identify import Identification, identify
+    from ckc_pin.identification.identify import identify
+    from ckc_pin.identification.result import Identification
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
@@ -133,7 +134,7 @@ MODULES = {
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
     "GainLocus": "linear.locus",
-    "Identification": "identification.identify",
+    "Identification": "identification.result",
     "InputError": "errors",
     "JointServo": "control.joint_servo",
     "LinearModel": "linear.linear_model",

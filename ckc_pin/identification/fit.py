@@ -21,7 +21,6 @@ HUBER = 2.5  # standard deviations from which residuals are weighted down
 MAX_PASSES, PASS_TOLERANCE = 30, 1e-6
 WHITE = 0.05  # largest autocorrelation of residuals that count as independent
 MAX_LAG = 0.05  # of the number of instants
-COEFFICIENT_TOLERANCE = 1e-6  # of the largest coefficient of a combination, in typical sizes
 NOISE_FLOOR = 1e-13  # of the largest right-hand side
 
 
@@ -60,19 +59,22 @@ class LinearFit(Immutable):
     condition: float
     rank: int
 
-    def combinations(self) -> tuple[IntArray, Array]:
+    def combinations(self, tolerance: float) -> tuple[IntArray, Array]:
         """Return one unknown for each determined direction, and coefficients (r, p) of what is determined.
 
-        Each combination contains its own unknown with coefficient 1, and none of the other chosen ones.
+        Each combination contains its own unknown with coefficient 1, and none of the other chosen ones. Coefficients
+        below `tolerance` of the largest one, in typical sizes, are rounding.
         """
         order, _ = pivoted_columns((self.determined * self.information).T)
         chosen = np.sort(order[: self.determined.shape[1]])
         coefficients = np.linalg.solve(self.determined[chosen].T, self.determined.T)
         largest = np.abs(coefficients).max(axis=1, initial=0.0, keepdims=True)
-        return chosen, np.where(np.abs(coefficients) > COEFFICIENT_TOLERANCE * largest, coefficients, 0.0)
+        return chosen, np.where(np.abs(coefficients) > tolerance * largest, coefficients, 0.0)
 
 
-def fit_linear(columns: Array, right: Array, *, robust: bool = False, noise: Array | None = None) -> LinearFit:
+def fit_linear(
+    columns: Array, right: Array, *, robust: bool = False, noise: Array | None = None, smallest: float = 0.0
+) -> LinearFit:
     """Solve columns x = right, (m, d, p) and (m, d), by iteratively reweighted least squares.
 
     The d equations of one instant are weighted by the inverse covariance of their residuals, which is estimated. With
@@ -82,6 +84,8 @@ def fit_linear(columns: Array, right: Array, *, robust: bool = False, noise: Arr
     ----------
     noise : (m, d, d) array, optional
         Covariances of the equations that are known; estimated if absent.
+    smallest : float
+        Singular values of the weighted columns up to this one are errors of the columns.
     """
     m, d, p = columns.shape
     floor = NOISE_FLOOR * max(float(np.abs(right).max(initial=0.0)), 1e-300)
@@ -92,7 +96,7 @@ def fit_linear(columns: Array, right: Array, *, robust: bool = False, noise: Arr
         A = (whitening @ columns) * np.sqrt(weights)[:, None, None]
         b = np.einsum("...ij,...j->...i", whitening, right) * np.sqrt(weights)[:, None]
         u, s, v = np.linalg.svd(A.reshape(-1, p), full_matrices=False)
-        rank = int(np.sum(s > STRUCTURAL_RANK_TOLERANCE * max(float(s[0]), 1e-300)))
+        rank = int(np.sum(s > max(STRUCTURAL_RANK_TOLERANCE * float(s[0]), smallest, 1e-300)))
         previous, x = x, v[:rank].T @ ((u[:, :rank].T @ b.ravel()) / s[:rank])
         residual = right - columns @ x
         if robust:
@@ -102,7 +106,10 @@ def fit_linear(columns: Array, right: Array, *, robust: bool = False, noise: Arr
         if noise is None:
             used = weights.sum() - rank / d
             covariance = np.einsum("k,ki,kj->ij", weights, residual, residual) / max(used, 1.0) + floor**2 * np.eye(d)
-        if np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and _ > 1:
+        is_final = noise is not None and not robust
+        if is_final or (
+            np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and _ > 1
+        ):
             break
     return _solution(A, b, u, s, v, rank, residual, covariance if noise is None else noise.mean(axis=0))
 

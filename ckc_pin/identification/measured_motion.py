@@ -19,7 +19,7 @@ from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "estimate_motion", "fit_spline", "motion_from_states"]
+__all__ = ["MeasuredMotion", "SplineFit", "estimate_motion", "estimate_start", "fit_spline", "motion_from_states"]
 
 DEGREE = 5
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
@@ -187,11 +187,7 @@ def estimate_motion(
     instants = instants[(instants >= t[0] + margin) & (instants <= t[-1] - margin)]
     if not len(instants):
         raise InputError(f"identify: the data last {t[-1] - t[0]:.3g} s, too short for a spline of {', '.join(names)}")
-    noise = np.array(
-        [max(fit.noise * fit.std[0], 1e-12 * tree.step_scale[k]) for k, fit in zip(at, fits.values(), strict=True)]
-    )
-    measured = np.array([fit.values(instants) for fit in fits.values()])  # (coordinates, 3, m)
-    nearest = _Nearest(mechanism, at, noise)
+    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
     here, few = (
         nearest.start(measured[0, 0], names),
@@ -213,6 +209,35 @@ def estimate_motion(
     return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std), dict(
         zip(names, distance.tolist(), strict=True)
     )
+
+
+def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
+    """Estimate all coordinates and the independent rates at one time from the splines of at least d coordinates.
+
+    Returns
+    -------
+    (n,) array
+        Coordinates.
+    (d,) array
+        Rates of the independent coordinates.
+
+    Raises
+    ------
+    InputError
+        As of `estimate_motion`.
+    """
+    at = mechanism.tree.indices(tuple(fits), "identify: data")
+    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    numbers, rates, accelerations = np.array([fit.values(np.array([t]))[:, 0] for fit in fits.values()]).T
+    here = nearest.start(numbers, list(fits))
+    _, v_tree, _ = nearest.rates(here.q_tree[None], rates[None], accelerations[None])
+    return mechanism.tree.to_coordinates(here.q_tree), v_tree[0, mechanism.partition.q]
+
+
+def _spline_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SplineFit]) -> Array:
+    """Return the standard deviations of splines, at least rounding errors."""
+    smallest = 1e-12 * mechanism.tree.step_scale[at]
+    return np.maximum([fit.noise * fit.std[0] for fit in fits.values()], smallest)
 
 
 class _Nearest:

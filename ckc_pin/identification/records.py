@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,13 @@ from ckc_pin.base.validation import suggest_name
 from ckc_pin.errors import InputError
 from ckc_pin.identification.spec import UNITS, DataSpec
 from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.run.columns import list_quantities
 from ckc_pin.run.run import Run
 
-__all__ = ["Record", "read_record"]
+__all__ = ["Record", "read_record", "require_radians"]
 
 MAX_BYTES = 2_000_000_000
+RECORDED = ("q_tree", "v_tree", "tau", "point_positions")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +89,7 @@ def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, f
         raise InputError(
             f"{source}: no column 't'; there are {', '.join(columns)}; names = {{t = \"COLUMN\"}} renames one"
         )
-    quantities = [*mechanism.coordinates, *(f"v.{name}" for name in mechanism.coordinates)]
-    quantities += [f"tau.{name}" for name in mechanism.motors.names]
+    quantities = {name for name, x in list_quantities(mechanism).items() if x.array in RECORDED}
     factors = {name: UNITS[unit] for name, unit in spec.units.items()}
     t = np.asarray(columns["t"], dtype=float) * factors.get("t", 1.0)
     _require_increasing(t, source)
@@ -160,3 +161,18 @@ def _require_increasing(t: Array, source: str) -> None:
     if len(back):
         k = int(back[0])
         raise InputError(f"{source}: t does not increase: {t[k]:.9g} is followed by {t[k + 1]:.9g} (row {k + 2})")
+
+
+def require_radians(mechanism: Mechanism, record: Record, names: Sequence[str]) -> None:
+    """Refuse readings of hinges that are degrees by their size."""
+    lower, upper = mechanism.tree.limits()
+    for name in names:
+        k = mechanism.tree.index[name]
+        x = record.values[name]
+        largest = float(np.nanmax(np.abs(x), initial=0.0))
+        bound = max(abs(lower[k]), abs(upper[k]))
+        if not mechanism.tree.in_metres[k] and largest > (1.5 * bound if np.isfinite(bound) else 50.0):
+            raise InputError(
+                f"identify: {record.source}: {name} reaches {largest:.4g} rad; if these are degrees, give "
+                f'units = {{{name} = "deg"}}'
+            )

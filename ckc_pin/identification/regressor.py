@@ -11,54 +11,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
-from fnmatch import fnmatchcase
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pinocchio as pin
 
-from ckc_pin.base.arrays import Array, Immutable
-from ckc_pin.base.validation import suggest_name
-from ckc_pin.errors import InputError
+from ckc_pin.base.arrays import Array
 from ckc_pin.identification.measured_motion import MeasuredMotion
-from ckc_pin.identification.pseudo_inertia import MOMENTS, move
+from ckc_pin.identification.pseudo_inertia import move
+from ckc_pin.identification.unknowns import INERTIAL, Unknown, Unknowns, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameter_map import ParameterMap, inertial_rotation
-from ckc_pin.mechanism.parameters import INERTIA_ENTRIES
+from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.springs import Springs
+from ckc_pin.mechanism.units import motor_units, parameter_unit
 
-__all__ = ["INERTIAL", "TorqueRegressor", "Unknown", "expand_names", "link_inertial_axes", "link_moments"]
+__all__ = ["TorqueRegressor"]
 
-INERTIAL = "inertial"  # link.NAME.inertial: the ten numbers of a link
 _LINEAR = {("joint", "friction"), ("joint", "damping"), ("joint", "armature"), ("spring", "stiffness"),
            ("spring", "damping"), ("force", "value"), ("motor", "rotor_inertia"), ("link", "mass")}  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown(Immutable):
-    """A number in which the torques are linear.
-
-    Attributes
-    ----------
-    name : str
-        A parameter's name; of a link's moments, ``link.NAME.moment.x`` and ``link.NAME.origin_inertia.ixx``.
-    start : float
-        Its value in the mechanism.
-    scale : float
-        A typical size, to compare numbers of different units.
-    slopes : mapping of str to array
-        Derivatives of the numbers of `model_numbers`, of the friction (n,), of the offsets of motors (motors,), and
-        of the dynamic parameters of bodies, ``body`` (joints - 1, 10).
-    """
-
-    name: str
-    start: float
-    scale: float
-    slopes: Mapping[str, Array]
-
-
-class TorqueRegressor:
+class TorqueRegressor(Unknowns):
     """The columns of unknown parameters in eq. 1 projected by rho^T.
 
     Parameters
@@ -75,21 +49,16 @@ class TorqueRegressor:
 
     Attributes
     ----------
-    unknowns : list of Unknown
-    links : list of str
-        Those whose ten inertial numbers are unknown.
+    parameters : ParameterMap
     """
 
     def __init__(self, mechanism: Mechanism, names: Sequence[str]) -> None:
         self.mechanism = mechanism
         self.parameters = ParameterMap(mechanism)
-        names = expand_names(mechanism, self.parameters, names)
+        names = expand_names(_candidates(mechanism, self.parameters), names, "torques are linear in")
+        links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
+        super().__init__(mechanism, [unknown for name in names for unknown in self._unknowns(name)], links)
         model = mechanism.tree.model
-        self._total_mass = sum(inertia.mass for inertia in model.inertias) or 1.0
-        self.links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
-        self.unknowns = [unknown for name in names for unknown in self._unknowns(name)]
-        self.start = np.array([unknown.start for unknown in self.unknowns])
-        self.scale = np.array([unknown.scale for unknown in self.unknowns])
         bodies = [inertia.toDynamicParameters() for inertia in list(model.inertias)[1:]]
         self._bodies = np.concatenate(bodies) if bodies else np.zeros(0)
         self._slopes = {key: np.zeros((len(self.unknowns), *shape)) for key, shape in self._shapes().items()}
@@ -161,58 +130,32 @@ class TorqueRegressor:
 
     def _unknowns(self, name: str) -> Iterator[Unknown]:
         root, carrier, key = name.split(".", 2)
-        size, mass = self.mechanism.size, self._total_mass
-        torque = mass * 9.81 * size
         if key == INERTIAL:
             yield from self._moments(carrier)
             return
         if root == "motor" and key == "offset":
             at = self.mechanism.motors.names.index(carrier)
+            torque = typical_size(self.mechanism, motor_units(self.mechanism)[at])
             yield Unknown(name, 0.0, torque, {"offset": np.eye(len(self.mechanism.motors.names))[at]})
             return
         slopes = dict(self.parameters.derivative(name))
         if root == "link":  # a link of unknown density
             joints = len(self.mechanism.tree.model.inertias)
             slopes = {"body": np.array([_dynamic_parameters(slopes, joint) for joint in range(1, joints)])}
-        time = (size / 9.81) ** 0.5
-        scales = {"mass": mass, "armature": mass * size**2, "rotor_inertia": mass * size**2, "damping": torque * time,
-                  "friction": torque, "value": torque, "stiffness": torque}  # fmt: skip
-        yield Unknown(name, self.parameters.value_of(name), scales[key], slopes)
+        scale = typical_size(self.mechanism, parameter_unit(self.mechanism, name))
+        yield Unknown(name, self.parameters.value_of(name), scale, slopes)
 
     def _moments(self, link: str) -> Iterator[Unknown]:
         """The ten numbers of a link, in the link's frame."""
-        mechanism = self.mechanism
-        placed = mechanism.frames.find(link, "identify")
-        start = link_moments(self.parameters, link)
-        mass = start[0] or self._total_mass
-        radius = np.sqrt((start[4] + start[6] + start[9]) / 2 / mass) or mechanism.size
-        scales = mass * radius ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
-        for k, number in enumerate(MOMENTS):
-            slope = np.zeros((mechanism.tree.model.njoints - 1, 10))
+        placed = self.mechanism.frames.find(link, "identify")
+        for k, unknown in enumerate(moment_unknowns(self.mechanism, self.parameters, link)):
+            slope = np.zeros((self.mechanism.tree.model.njoints - 1, 10))
             slope[placed.joint - 1] = move(np.eye(10)[k], placed.rotation, placed.translation)
-            yield Unknown(f"link.{link}.{number}", start[k], scales[k], {"body": slope})
+            yield replace(unknown, slopes={"body": slope})
 
 
 def _elastic_force(springs: Springs, q_tree: Array, v_tree: Array) -> Array:
     return springs.elastic_force(q_tree)
-
-
-def link_inertial_axes(mechanism: Mechanism, link: str) -> Array:
-    """Return the axes of a link's inertial frame in the link's frame, shape (3, 3)."""
-    inertial = next(x for x in mechanism.urdf.findall("link") if x.attrib["name"] == link).find("inertial")
-    assert inertial is not None
-    return inertial_rotation(inertial)
-
-
-def link_moments(parameters: ParameterMap, link: str) -> Array:
-    """Return the ten inertial numbers of a link in its own frame."""
-    values = parameters.values
-    tensor = np.zeros((3, 3))
-    for entry, (i, j) in INERTIA_ENTRIES.items():
-        tensor[i, j] = tensor[j, i] = values[f"link.{link}.inertia.{entry}"]
-    rotation, centre = link_inertial_axes(parameters.mechanism, link), np.array(values[f"link.{link}.com"])
-    inertia = pin.Inertia(float(values[f"link.{link}.mass"]), centre, rotation @ tensor @ rotation.T)  # type: ignore[arg-type]
-    return np.asarray(inertia.toDynamicParameters())
 
 
 def _dynamic_parameters(slopes: Mapping[str, Array], joint: int) -> Array:
@@ -220,31 +163,6 @@ def _dynamic_parameters(slopes: Mapping[str, Array], joint: int) -> Array:
     inertia = slopes["origin_inertia"][joint]
     return np.array([slopes["mass"][joint], *slopes["moment"][joint], inertia[0, 0], inertia[0, 1], inertia[1, 1],
                      inertia[0, 2], inertia[1, 2], inertia[2, 2]])  # fmt: skip
-
-
-def expand_names(mechanism: Mechanism, parameters: ParameterMap, patterns: Sequence[str]) -> list[str]:
-    """Return the parameters that patterns with wildcards stand for, in the order of the mechanism, each once.
-
-    Raises
-    ------
-    InputError
-        A pattern that no parameter matches; the message lists the kinds that exist.
-    """
-    names = list(_candidates(mechanism, parameters))
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in names):
-            kinds = sorted({".".join((name.split(".")[0], "*", name.split(".", 2)[2])) for name in names})
-            raise InputError(
-                f"identify: parameters: nothing is called {pattern!r}{suggest_name(pattern, names)}; torques are "
-                f"linear in {', '.join(kinds)}"
-            )
-    chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
-    whole = {name.split(".")[1] for name in chosen if name.endswith(f".{INERTIAL}")}
-    return [
-        name
-        for name in chosen
-        if not (name.startswith("link.") and name.endswith(".mass") and name.split(".")[1] in whole)
-    ]
 
 
 def _candidates(mechanism: Mechanism, parameters: ParameterMap) -> Iterator[str]:

@@ -30,7 +30,7 @@ class DataSpec(_Spec, frozen=True):
     ----------
     file
         A CSV or Parquet file in the folder of this one. Its columns are ``t`` and quantities by name: coordinates,
-        ``v.COORDINATE``, and ``tau.MOTOR``. An empty field is a gap.
+        ``v.COORDINATE``, ``tau.MOTOR``, and points as ``tip.x``. An empty field is a gap.
         ``file = "swing.csv"``
     noise : the quantity's
         Standard deviations of measurements by quantity; estimated for the others.
@@ -70,10 +70,11 @@ class EstimateSpec(_Spec, frozen=True):
         Names of parameters, with wildcards. ``link.NAME.inertial`` are the ten inertial numbers of a link.
         ``parameters = ["link.*.inertial", "joint.*.friction"]``
     method
-        ``"torques"``: eq. 1, which is linear in the parameters.
-        ``method = "torques"``
+        ``"torques"``: eq. 1, which is linear in the parameters. ``"motion"``: simulated runs are fitted to what was
+        measured.
+        ``method = "motion"``
     physical
-        Whether inertias have to be those of a body that can exist.
+        Whether inertias have to be those of a body that can exist. Runs need such inertias.
         ``physical = false``
     robust
         Whether instants with large residuals have less weight.
@@ -81,7 +82,7 @@ class EstimateSpec(_Spec, frozen=True):
     """
 
     parameters: Annotated[list[str], msgspec.Meta(min_length=1)]
-    method: Literal["torques"] = "torques"
+    method: Literal["torques", "motion"] = "torques"
     physical: bool = True
     robust: bool = False
 

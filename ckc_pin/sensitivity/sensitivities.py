@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -267,6 +267,7 @@ def sensitivities(
     *,
     controller: Controller | Sampled | ControlLaw | Mapping[str, Any] | None = None,
     events: Sequence[Event | Mapping[str, Any]] = (),
+    instants: Array | None = None,
 ) -> Sensitivities:
     """Run a scene and compute the derivatives of its motion with respect to parameters.
 
@@ -294,6 +295,8 @@ def sensitivities(
         right-hand side or sample.
     events : sequence of Event or mapping, optional
         As in `simulate`.
+    instants : (m,) array, optional
+        Output instants, instead of the scene's, s: increasing, from 0 to at most t_end.
 
     Returns
     -------
@@ -318,6 +321,8 @@ def sensitivities(
     if not parameters:
         raise InputError("sensitivities: name at least one parameter")
     ready = prepare(scene, controller, events, set_up_sensitivities=sensitivity_setup(tuple(parameters)))
+    if instants is not None:
+        ready = replace(ready, instants=_require_instants(instants, scene.spec.t_end))
     started = perf_counter()
     try:
         rows, status, message = record_rows(ready, progress)
@@ -335,6 +340,17 @@ def sensitivities(
     sensitivity_parameters = _sensitivity_parameters(ready)
     names = tuple(x.name for x in sensitivity_parameters)
     return Sensitivities(run, names, q_tree, v_tree, u, tau, _compute_end_time(ready), sensitivity_parameters)
+
+
+def _require_instants(instants: Array, t_end: float) -> Array:
+    times = np.asarray(instants, dtype=float)
+    valid = times.ndim == 1 and len(times) > 0 and times[0] == 0 and times[-1] <= t_end and np.all(np.diff(times) > 0)
+    if not valid:
+        raise InputError(
+            f"sensitivities: instants: expected increasing times from 0 to at most t_end = {t_end:g} s, "
+            f"got {describe_value(instants)}"
+        )
+    return times
 
 
 def _sensitivity_parameters(ready: Prepared) -> tuple[SensitivityParameter, ...]:

@@ -1,13 +1,15 @@
-"""Figures of an identification: torques, residuals, and the correlation of the parameters."""
+"""Figures of an identification: predictions, residuals, and the correlation of the parameters."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ckc_pin.identification.identify import Identification
+from ckc_pin.identification.result import Identification
+from ckc_pin.run.columns import list_quantities
 from ckc_pin.view import style
 from ckc_pin.view.layout import write_figure
 from ckc_pin.view.style import escape_mathtext, figure_style
@@ -24,7 +26,7 @@ POINTS = 4000  # of a curve
 
 
 def save_identification(result: Identification, folder: Path) -> list[Path]:
-    """Write torques.png, residuals.png and, for two parameters or more, correlation.png.
+    """Write torques.png or motion.png, residuals.png and, for two parameters or more, correlation.png.
 
     Raises
     ------
@@ -39,7 +41,7 @@ def save_identification(result: Identification, folder: Path) -> list[Path]:
 
 
 def draw_identification(result: Identification) -> dict[str, Figure]:
-    """Return the figures "torques", "residuals" and, for two parameters or more, "correlation".
+    """Return the figures "torques" or "motion", "residuals" and, for two parameters or more, "correlation".
 
     Raises
     ------
@@ -47,56 +49,67 @@ def draw_identification(result: Identification) -> dict[str, Figure]:
         matplotlib is not installed.
     """
     with figure_style():
-        figures = {"torques": _draw_torques(result), "residuals": _draw_residuals(result)}
+        figures = {result.method: _draw_predictions(result), "residuals": _draw_residuals(result)}
         if len(result.identified) > 1:
             figures["correlation"] = _draw_correlation(result)
         return figures
 
 
-def _draw_torques(result: Identification) -> Figure:
-    """Draw measured and predicted torques of the last record, which is one for validation if there is one."""
+def _draw_predictions(result: Identification) -> Figure:
+    """Draw measured and predicted quantities of the last record, which is one for validation if there is one."""
     from matplotlib.figure import Figure
 
     motion = sorted(result.motions, key=lambda x: x.validation)[-1]
-    motors = result.mechanism.motors.names
-    figure = Figure(figsize=(7.0, 1.2 + 1.8 * len(motors)), layout="constrained")
-    panels = figure.subplots(len(motors), sharex=True, squeeze=False)[:, 0]
+    names, labels = motion.quantities, _labels(result, motion.quantities)
+    figure = Figure(figsize=(7.0, 1.2 + 1.8 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), sharex=True, squeeze=False)[:, 0]
     kind = "not fitted" if motion.validation else "fitted"
     figure.suptitle(f"{escape_mathtext(motion.source)}, {kind}", x=0.01, ha="left", fontweight="bold")
     stride = max(1, len(motion.t) // POINTS)
-    for ax, motor, measured, predicted in zip(panels, motors, motion.measured.T, motion.predicted.T, strict=True):
+    for ax, label, measured, predicted in zip(panels, labels, motion.measured.T, motion.predicted.T, strict=True):
         ax.plot(motion.t[::stride], measured[::stride], color=style.COLOURS[0], linewidth=0.8, label="measured")
         ax.plot(motion.t[::stride], predicted[::stride], color=style.COLOURS[1], linewidth=1.2, label="predicted")
-        ax.set_ylabel(f"{escape_mathtext(motor)} [N m]")
+        ax.set_ylabel(label)
     panels[0].legend(loc="upper right", ncols=2, fontsize=8)
     panels[-1].set_xlabel("time [s]")
     return figure
 
 
 def _draw_residuals(result: Identification) -> Figure:
-    """Draw the torque residuals of all fitted records over time, and their autocorrelation."""
+    """Draw the residuals of all fitted records over time, and their autocorrelation."""
     from matplotlib.figure import Figure
 
-    motors = result.mechanism.motors.names
-    figure = Figure(figsize=(8.0, 1.2 + 1.8 * len(motors)), layout="constrained")
-    panels = figure.subplots(len(motors), 2, squeeze=False, width_ratios=(2, 1), sharex="col")
-    for k, (motor, (over_time, correlation)) in enumerate(zip(motors, panels, strict=True)):
-        for number, motion in enumerate(x for x in result.motions if not x.validation):
-            residual = (motion.measured - motion.predicted)[:, k]
-            stride = max(1, len(motion.t) // POINTS)
+    names = tuple(result.residuals)
+    figure = Figure(figsize=(8.0, 1.2 + 1.8 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), 2, squeeze=False, width_ratios=(2, 1), sharex="col")
+    fitted = [x for x in result.motions if not x.validation]
+    for name, label, (over_time, correlation) in zip(names, _labels(result, names), panels, strict=True):
+        for number, motion in enumerate(fitted):
+            if name not in motion.quantities:
+                continue
+            k = motion.quantities.index(name)
+            residual = motion.measured[:, k] - motion.predicted[:, k]
+            t, residual = motion.t[np.isfinite(residual)], residual[np.isfinite(residual)]
+            stride = max(1, len(t) // POINTS)
             colour = style.COLOURS[number % len(style.COLOURS)]
-            over_time.plot(motion.t[::stride], residual[::stride], ".", markersize=1.5, color=colour)
+            over_time.plot(t[::stride], residual[::stride], ".", markersize=1.5, color=colour)
             lags = np.arange(1, min(MAX_LAGS, len(residual) - 1))
             power = max(float(residual @ residual), 1e-300)
             correlation.plot(lags, [residual[lag:] @ residual[:-lag] / power for lag in lags], color=colour)
             bound = CONFIDENCE / np.sqrt(len(residual))
             correlation.axhspan(-bound, bound, color="0.85", zorder=0)
-        over_time.set_ylabel(f"{escape_mathtext(motor)} [N m]")
+        over_time.set_ylabel(label)
     panels[0, 0].set_title("measured less predicted", loc="left")
     panels[0, 1].set_title("autocorrelation", loc="left")
     panels[-1, 0].set_xlabel("time [s]")
     panels[-1, 1].set_xlabel("lag [instants]")
     return figure
+
+
+def _labels(result: Identification, names: Sequence[str]) -> list[str]:
+    """Return the labels of quantities; motors are known without their prefix."""
+    quantities = list_quantities(result.mechanism)
+    return [f"{escape_mathtext(name.removeprefix('tau.'))} [{quantities[name].unit}]" for name in names]
 
 
 def _draw_correlation(result: Identification) -> Figure:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.errors import InputError
-from ckc_pin.identification.identify import Identification
+from ckc_pin.identification.result import Identification
 from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus

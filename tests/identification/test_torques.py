@@ -12,7 +12,8 @@ from scipy.stats import binom
 import ckc_pin
 from ckc_pin import InputError, Mechanism, identify, inverse_dynamics, load
 from ckc_pin.identification.pseudo_inertia import MOMENTS, pseudo_inertia
-from ckc_pin.identification.regressor import TorqueRegressor, link_moments
+from ckc_pin.identification.regressor import TorqueRegressor
+from ckc_pin.identification.unknowns import link_moments
 from tests.contract.helpers.command import ckc
 
 FRICTION = {

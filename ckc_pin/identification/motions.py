@@ -1,0 +1,459 @@
+"""Parameters from measured motions: simulated runs are fitted to what was measured (output error).
+
+Each record is simulated with its motor torques from a start that is estimated too. With the exact sensitivities of the
+run, each step is a linear least-squares problem. The unknowns of the starts are eliminated from it by projection, so
+what remains says what the data determine of the parameters, as for torques:
+
+    minimize  |W (y - y(p, s) - J_p dp - J_s ds)|^2  =  |(1 - Q Q^T) W (y - y(p, s) - J_p dp)|^2,  W J_s = Q R.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable, IntArray
+from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
+from ckc_pin.control.controllers import RecordedTorques
+from ckc_pin.errors import CkcError, InputError, NumericalError
+from ckc_pin.identification.fit import HUBER, LinearFit, fit_linear
+from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_spline
+from ckc_pin.identification.records import Record, require_radians
+from ckc_pin.identification.result import Identification, Prediction, make_result
+from ckc_pin.identification.unknowns import INERTIAL, Unknown, Unknowns, expand_names, moment_unknowns, typical_size
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import ParameterMap
+from ckc_pin.mechanism.parameters import with_components
+from ckc_pin.mechanism.units import parameter_unit
+from ckc_pin.run.columns import list_quantities
+from ckc_pin.scene.scene import Scene
+from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
+
+__all__ = ["identify_motion"]
+
+RTOL = 1e-10  # of runs
+COLUMN_TOLERANCE = 1e-7  # of the sensitivities' largest singular value: smaller ones are errors of the integration
+LEAK_TOLERANCE = 1e-5  # part of a gradient in directions that are not determined
+NOISE_FLOOR = 1e-9  # of the size of a coordinate: smaller residuals are errors of the integration
+EXACT = 100.0  # residuals up to so many of these floors need no smaller ones
+MAX_STEPS = 60
+MIN_STEP_SIZE = 1e-3  # part of a Gauss-Newton step
+COST_TOLERANCE = 1e-6  # relative: a smaller decrease of the cost ends the fit
+FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records
+PROMISING = 1e-3  # part of the cost by which the linear model says that it can still decrease
+MEDIAN = 0.6745  # of the absolute value of a standard normal variable
+HORIZONS = (0.1, 0.3)  # parts of the records that are fitted first, where runs from the start values leave the data
+LOST = 0.5  # residual of such runs, in standard deviations of the measurements over time
+SUSPICIOUS = 3.0  # residual in units of the noise of a quantity's spline
+SUSPICIOUS_RMS = 1e-5  # rad or m: the smallest residual that is worth a warning
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion(Immutable):
+    """One record, and what its runs need.
+
+    Attributes
+    ----------
+    names : list of str
+        Measured quantities.
+    t : (m, k) array
+        Times of the values, from the start of the run, s.
+    values : (m, k) array
+        NaN marks gaps.
+    controller : RecordedTorques or None
+    q, q_dot : (n,) and (d,) arrays
+        First guess of the start.
+    splines : mapping of str to SplineFit
+        Of the coordinates that gave it.
+    """
+
+    record: Record
+    names: list[str]
+    t: Array
+    values: Array
+    controller: RecordedTorques | None
+    q: Array
+    q_dot: Array
+    splines: Mapping[str, SplineFit]
+
+    def until(self, part: float) -> _Motion:
+        """Return the first part of the record."""
+        return replace(self, values=np.where(self.t <= part * np.nanmax(self.t), self.values, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class _Run(Immutable):
+    """A run from a start (n,) and (d,), and its derivatives by unknown (m, k, p) and by start (m, k, 2 d)."""
+
+    q: Array
+    q_dot: Array
+    predicted: Array
+    by_unknown: Array
+    by_start: Array
+
+
+class _RunError(Exception):
+    """A run did not reach the last measurement, or its mechanism cannot be built; its cause is what is wrong."""
+
+
+def identify_motion(
+    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool
+) -> Identification:
+    """Estimate parameters by fitting runs to measurements (InputError, NumericalError)."""
+    unknowns = _make_unknowns(mechanism, parameters)
+    warnings: list[str] = []
+    with one_blas_thread(with_scipy=True):
+        motions = [_read_motion(mechanism, record, warnings) for record in records]
+        fitted = [x for x in motions if not x.record.validation]
+        count = sum(int(np.sum(np.isfinite(x.values))) for x in fitted)
+        needed = len(unknowns.names) + 2 * mechanism.d * len(fitted)
+        if count < needed:
+            raise InputError(
+                f"identify: {count} measurements for {needed} unknowns; record a longer motion or estimate less"
+            )
+        none = np.zeros((len(unknowns.names), 0))
+        fit = _Fit(unknowns, fitted, unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0)), robust=robust)
+        fit.solve()
+        others = [_follow(unknowns, x, fit.x, robust=robust) for x in motions if x.record.validation]
+    predictions = [x for part in (fit, *others) for x in part.predictions()]
+    for x in predictions[: len(fitted)]:
+        warnings += list(_misfits(x, fitted))
+    return make_result(
+        "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
+        complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
+    )  # fmt: skip
+
+
+def _follow(unknowns: Unknowns, motion: _Motion, x: Array, *, robust: bool) -> _Fit:
+    """Fit the start of a record only."""
+    fit = _Fit(unknowns, [motion], x, robust=robust, starts_only=True)
+    fit.solve()
+    return fit
+
+
+def _misfits(prediction: Prediction, motions: Sequence[_Motion]) -> Iterator[str]:
+    """Yield warnings about residuals that are much larger than the noise which the splines see."""
+    splines = next(x.splines for x in motions if x.record.source == prediction.source)
+    for name, spline in splines.items():
+        k = prediction.quantities.index(name)
+        rms = float(np.sqrt(np.nanmean((prediction.measured[:, k] - prediction.predicted[:, k]) ** 2)))
+        noise = max(spline.noise, NOISE_FLOOR)
+        if rms > SUSPICIOUS * noise and rms > SUSPICIOUS_RMS:
+            yield (
+                f"{prediction.source}: the residual of {name} is {rms:.3g}, {rms / noise:.0f} times its noise; the "
+                "model does not explain the motion, or the fit ended in a local minimum"
+            )
+
+
+def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
+    """Return the unknowns of names with wildcards (InputError)."""
+    parameters = ParameterMap(mechanism)
+    values = with_components(parameters.values)
+    moving = [name for name, frame in mechanism.frames.links.items() if frame.joint != 0]
+    singles = [name for name, x in values.items() if not isinstance(x, tuple)]
+    singles = [name for name in singles if not name.startswith("link.") or name.split(".")[1] in moving]
+    inertial = [f"link.{name}.{INERTIAL}" for name in moving if f"link.{name}.mass" in values]
+    names = expand_names([*inertial, *singles], patterns, "runs have derivatives with respect to")
+    links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
+    unknowns: list[Unknown] = []
+    for name in names:
+        if name.endswith(f".{INERTIAL}"):
+            unknowns += moment_unknowns(mechanism, parameters, name.split(".")[1])
+        else:
+            scale = typical_size(mechanism, parameter_unit(mechanism, name))
+            unknowns.append(Unknown(name, parameters.value_of(name), scale))
+    return Unknowns(mechanism, unknowns, links)
+
+
+# --- records ---------------------------------------------------------------------------------------
+
+
+def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _Motion:
+    """Return a record with the torques of its run, and estimate its start."""
+    coordinates = [name for name in mechanism.coordinates if name in record.values]
+    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
+    missing = [name for name in torques if name not in record.values]
+    if len(coordinates) < mechanism.d or 0 < len(missing) < len(torques):
+        required = mechanism.independent if len(coordinates) < mechanism.d else missing
+        raise InputError(
+            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torques of "
+            f"all motors or of none are needed, there are {', '.join(record.values) or 'none'}"
+        )
+    if missing:
+        warnings.append(f"{record.source}: no torques were recorded, so the motors count as unpowered")
+    require_radians(mechanism, record, coordinates)
+    names = [name for name in record.values if name not in torques]
+    t = np.array([record.times(name) for name in names]).T
+    values = np.array([record.values[name] for name in names]).T
+    first = float(t[np.isfinite(values)].min(initial=np.inf))
+    chosen = list(mechanism.independent)
+    if not set(chosen) <= set(coordinates):
+        at = mechanism.tree.indices(tuple(coordinates), "identify: data")
+        order, _ = pivoted_columns(mechanism.assembled.rho[at].T)
+        chosen = [coordinates[k] for k in np.sort(order[: mechanism.d])]
+    splines = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in chosen}
+    q, q_dot = estimate_start(mechanism, splines, first)
+    controller = None if missing or not torques else _recorded_torques(record, torques, first, float(t.max()))
+    return _Motion(record, names, t - first, values, controller, q, q_dot, splines)
+
+
+def _recorded_torques(record: Record, torques: Sequence[str], first: float, last: float) -> RecordedTorques:
+    """Return the torques of a run from the first measurement on, interpolated linearly, also over gaps."""
+    measured = {name: np.isfinite(record.values[name]) for name in torques}
+    empty = next((name for name, x in measured.items() if not x.any()), None)
+    if empty is not None:
+        raise InputError(f"identify: {record.source}: {empty} has no value; give the torque, 0 if there is none")
+    times = np.unique(np.concatenate([[first, last], *(record.times(name)[x] for name, x in measured.items())]))
+    times = times[(times >= first) & (times <= last)]
+    columns = [np.interp(times, record.times(name)[x], record.values[name][x]) for name, x in measured.items()]
+    return RecordedTorques(times - first, np.array(columns).T, interpolates=True)
+
+
+# --- runs ------------------------------------------------------------------------------------------
+
+
+def _simulate(unknowns: Unknowns, motion: _Motion, x: Array, q: Array, q_dot: Array) -> _Run:
+    """Simulate a record from a start, with derivatives.
+
+    Raises
+    ------
+    _RunError
+    """
+    mechanism = unknowns.mechanism
+    parameters = unknowns.parameters_at(unknowns.start + unknowns.scale * x)
+    start = [f"initial.{key}.{name}" for key in ("q", "q_dot") for name in mechanism.independent]
+    measured = np.isfinite(motion.values)
+    instants, where = np.unique(np.append(motion.t[measured], 0.0), return_inverse=True)
+    try:
+        scene = Scene(
+            mechanism, t_end=max(float(instants[-1]), 1e-9), formulation="dae", controller=motion.controller,
+            initial={"q": dict(zip(mechanism.coordinates, q.tolist(), strict=True)),
+                     "q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))},
+            parameters={p.name: p.value for p in parameters}, solver={"rtol": RTOL, "atol": RTOL / 10},
+        )  # fmt: skip
+        result = sensitivities(scene, [*(p.name for p in parameters), *start], instants=instants)
+    except CkcError as error:
+        raise _RunError(str(error)) from error
+    if result.run.status != "done":
+        raise _RunError(f"the run {result.run.message}")
+    index = np.zeros(motion.values.shape, dtype=np.intp)
+    index[measured] = where[:-1]
+    predicted, slopes = _outputs(result, motion.names, index)
+    gradients = np.array([p.gradient for p in parameters]).reshape(len(parameters), -1)
+    by_unknown = slopes[:, :, : len(parameters)] @ gradients * unknowns.scale
+    return _Run(result.run.q_tree[0], q_dot, predicted, by_unknown, slopes[:, :, len(parameters) :])
+
+
+def _outputs(result: Sensitivities, names: Sequence[str], index: IntArray) -> tuple[Array, Array]:
+    """Return the measured quantities of a run (m, k) at given rows, and their derivatives (m, k, parameters)."""
+    columns = [result.run[name][index[:, k]] for k, name in enumerate(names)]
+    slopes = [result[name][index[:, k]] for k, name in enumerate(names)]
+    return np.array(columns).T, np.array(slopes).transpose(1, 0, 2)
+
+
+# --- least squares ---------------------------------------------------------------------------------
+
+
+class _Fit:
+    """Fits runs of records to their measurements by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    unknowns : Unknowns
+    motions : sequence of _Motion
+    x : (p,) array
+        Steps of the unknowns from their start, in typical sizes, to begin with.
+    robust : bool
+        Whether large residuals have less weight.
+    starts_only : bool
+        Whether x remains as it is.
+    """
+
+    def __init__(
+        self, unknowns: Unknowns, motions: Sequence[_Motion], x: Array, *, robust: bool, starts_only: bool = False
+    ) -> None:
+        self.unknowns, self.motions, self.x = unknowns, motions, x
+        self.robust, self.starts_only = robust, starts_only
+        self.starts = [(motion.q, motion.q_dot) for motion in motions]
+        self.runs: list[_Run] = []
+        mechanism, quantities = unknowns.mechanism, list_quantities(unknowns.mechanism)
+        self.at = mechanism.tree.indices(mechanism.independent, "identify")
+        self.floors = [
+            NOISE_FLOOR * np.array([typical_size(mechanism, quantities[name].unit) for name in motion.names])
+            for motion in motions
+        ]
+
+    def solve(self) -> None:
+        """Fit all motions (InputError, NumericalError).
+
+        If runs from the start values leave the data, the first parts of the records are fitted before.
+        """
+        whole = self.motions
+        error = self._begin()
+        if error is not None or self._is_lost():
+            for part in HORIZONS:
+                self.motions = [motion.until(part) for motion in whole]
+                error = self._begin()
+                if error is not None:
+                    break
+                self._iterate(FIRST_COST_TOLERANCE)
+            self.motions = whole
+            error = error or self._begin()
+        if error is not None:
+            cause = error.__cause__
+            if isinstance(cause, InputError):
+                raise cause
+            raise NumericalError(
+                f"identify: {whole[0].record.source}: no run from the start values reaches the last measurement: "
+                f"{error}; give better start values, or a shorter span"
+            )
+        self._iterate(COST_TOLERANCE)
+
+    def _begin(self) -> _RunError | None:
+        try:
+            self.runs = self._simulate(self.x, self.starts)
+        except _RunError as error:
+            return error
+        return None
+
+    def _simulate(self, x: Array, starts: Sequence[tuple[Array, Array]]) -> list[_Run]:
+        return [_simulate(self.unknowns, motion, x, *start) for motion, start in zip(self.motions, starts, strict=True)]
+
+    def _is_lost(self) -> bool:
+        for motion, run in zip(self.motions, self.runs, strict=True):
+            rms = np.sqrt(np.nanmean((motion.values - run.predicted) ** 2, axis=0))
+            if np.any(rms > LOST * np.nanstd(motion.values, axis=0)):
+                return True
+        return False
+
+    def _iterate(self, tolerance: float) -> None:
+        """Take steps until the cost no longer decreases."""
+        for _ in range(MAX_STEPS):
+            stds = [self._stds(k, self.runs[k]) for k in range(len(self.motions))]
+            dx, start_steps = self._step(stds)
+            cost, size, reason = self._cost(self.runs, stds), 1.0, ""
+            while size >= MIN_STEP_SIZE:
+                x = self.x + size * dx
+                starts = [
+                    self._moved(run, size * start_step) for run, start_step in zip(self.runs, start_steps, strict=True)
+                ]
+                try:
+                    runs = self._simulate(x, starts)
+                except _RunError as error:
+                    reason = str(error)
+                else:
+                    if (decrease := cost - self._cost(runs, stds)) > 0:
+                        break
+                size /= 2
+            else:
+                self._require_minimum(stds, dx, start_steps, reason)
+                return
+            self.x, self.starts, self.runs = x, starts, runs
+            if decrease <= tolerance * cost:
+                return
+        raise NumericalError(f"identify: the fit of runs did not converge in {MAX_STEPS} steps; {self._reached()}")
+
+    def _moved(self, run: _Run, start_step: Array) -> tuple[Array, Array]:
+        d = len(self.at)
+        q = run.q.copy()
+        q[self.at] += start_step[:d]
+        return q, run.q_dot + start_step[d:]
+
+    def _require_minimum(self, stds: Sequence[Array], dx: Array, start_steps: Sequence[Array], reason: str) -> None:
+        """Refuse a fit that cannot go on although the linear model promises a smaller cost."""
+        now, predicted, exact = self._cost(self.runs, stds), 0.0, True
+        for k, (motion, run, start_step) in enumerate(zip(self.motions, self.runs, start_steps, strict=True)):
+            moved = replace(run, predicted=run.predicted + run.by_unknown @ dx + run.by_start @ start_step)
+            predicted += self._cost_of(motion, moved, stds[k])
+            exact = exact and bool(np.nanmax(np.abs(motion.values - run.predicted) / self.floors[k]) <= EXACT)
+        if now - predicted > PROMISING * now and not exact:
+            raise NumericalError(
+                f"identify: the fit of runs stopped where no step makes the residuals smaller; {self._reached()}"
+                + (f"; the last step failed: {reason}" if reason else "")
+            )
+
+    def _reached(self) -> str:
+        texts = []
+        for motion, run in zip(self.motions, self.runs, strict=True):
+            rms = np.sqrt(np.nanmean((motion.values - run.predicted) ** 2, axis=0))
+            texts += [f"{name} {x:.3g}" for name, x in zip(motion.names, rms, strict=True)]
+        return f"the rms residuals are {', '.join(texts)}; give better start values, or a shorter span"
+
+    def _stds(self, k: int, run: _Run) -> Array:
+        """Return the standard deviations by which a record's residuals are divided, (quantities,)."""
+        motion = self.motions[k]
+        residual = motion.values - run.predicted
+        count = np.isfinite(residual).sum(axis=0)
+        used = 2 * len(self.at) + (0 if self.starts_only else len(self.unknowns.names) / len(self.motions))
+        free = max(1 - used / count.sum(), 1 / count.sum())
+        if self.robust:
+            estimate = np.nanmedian(np.abs(residual), axis=0) / MEDIAN
+        else:
+            estimate = np.sqrt(np.nanmean(residual**2, axis=0) / free)
+        noise = [motion.record.noise.get(name, 0.0) for name in motion.names]
+        return np.maximum(np.maximum(estimate, noise), self.floors[k])
+
+    def _cost(self, runs: Sequence[_Run], stds: Sequence[Array]) -> float:
+        return sum(self._cost_of(*parts) for parts in zip(self.motions, runs, stds, strict=True))
+
+    def _cost_of(self, motion: _Motion, run: _Run, stds: Array) -> float:
+        sizes = np.abs(motion.values - run.predicted) / stds
+        if self.robust:
+            sizes = np.sqrt(np.where(sizes > HUBER, 2 * HUBER * sizes - HUBER**2, sizes**2))
+        cost = float(np.nansum(sizes**2))
+        return cost if np.isfinite(cost) else np.inf
+
+    def _equations(self, k: int, stds: Array) -> tuple[Array, Array, Array]:
+        """Return weighted derivatives by unknown and by start, and residuals, ordered by quantity and time."""
+        motion, run = self.motions[k], self.runs[k]
+        residual = motion.values - run.predicted
+        weight = np.ones_like(residual)
+        if self.robust:
+            weight = np.sqrt(np.minimum(1.0, HUBER * stds / np.maximum(np.abs(residual), 1e-300)))
+        weight = weight / stds
+        measured = np.isfinite(residual).T
+        parts = (run.by_unknown * weight[:, :, None], run.by_start * weight[:, :, None], residual * weight)
+        by_unknown, by_start, right = (part.swapaxes(0, 1)[measured] for part in parts)
+        return by_unknown, by_start, right
+
+    def linear(self, stds: Sequence[Array] | None = None) -> LinearFit:
+        """Solve the linear problem at the present values for the unknowns."""
+        columns, rights, largest = [], [], 0.0
+        for k in range(len(self.motions)):
+            by_unknown, by_start, right = self._equations(k, self._stds(k, self.runs[k]) if stds is None else stds[k])
+            largest = max(largest, float(np.linalg.norm(by_unknown, 2)))
+            Q = np.linalg.qr(by_start / np.maximum(np.linalg.norm(by_start, axis=0), 1e-300))[0]
+            columns.append(by_unknown - Q @ (Q.T @ by_unknown))
+            rights.append(right - Q @ (Q.T @ right))
+        A, b = np.concatenate(columns)[:, None], np.concatenate(rights)[:, None]
+        return fit_linear(A, b, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
+
+    def _step(self, stds: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Return the steps of the unknowns and of the start of each record."""
+        dx: Array = np.zeros(len(self.x))
+        if not self.starts_only:
+            fit = self.linear(stds)
+            dx = self.unknowns.nearest_physical(self.x + fit.x, fit.determined, fit.information) - self.x
+        start_steps: list[Array] = []
+        for k, std in enumerate(stds):
+            by_unknown, by_start, right = self._equations(k, std)
+            start_steps.append(
+                np.asarray(np.linalg.lstsq(by_start, right - by_unknown @ dx, rcond=1e-12)[0], dtype=float)
+            )
+        return dx, start_steps
+
+    def predictions(self) -> list[Prediction]:
+        """Return measured and predicted quantities of the records."""
+        predictions = []
+        for k, (motion, run) in enumerate(zip(self.motions, self.runs, strict=True)):
+            stds = self._stds(k, run)
+            noise = [motion.record.noise.get(name, std) for name, std in zip(motion.names, stds, strict=True)]
+            variances = {name: float(std) ** 2 for name, std in zip(motion.names, noise, strict=True)}
+            predicted = np.where(np.isfinite(motion.values), run.predicted, np.nan)
+            predictions.append(
+                Prediction(motion.record.source, motion.record.validation, tuple(motion.names), motion.record.t,
+                           motion.values, predicted, variances)
+            )  # fmt: skip
+        return predictions

@@ -1,0 +1,126 @@
+"""Parameters from measured torques: eq. 1 along the measured motion, linear in the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.errors import InputError
+from ckc_pin.identification.fit import LinearFit, fit_linear
+from ckc_pin.identification.measured_motion import MeasuredMotion, estimate_motion, fit_spline
+from ckc_pin.identification.records import Record, require_radians
+from ckc_pin.identification.regressor import TorqueRegressor
+from ckc_pin.identification.result import Identification, Prediction, make_result
+from ckc_pin.mechanism.mechanism import Mechanism
+
+__all__ = ["identify_torques"]
+
+MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
+LEAK_TOLERANCE = 1e-6  # part of a gradient in directions that are not determined
+SATURATED = 0.999  # of a torque limit
+MAX_SATURATED = 0.5  # share of instants
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """The equations of one record.
+
+    Attributes
+    ----------
+    columns : (m, d, p) array
+        In typical sizes of the unknowns.
+    right : (m, d) array
+    to_motors : (m, motors, d) array
+        Torques that give generalized forces, least-squares.
+    tau : (m, motors) array
+    """
+
+    record: Record
+    motion: MeasuredMotion
+    columns: Array
+    right: Array
+    to_motors: Array
+    tau: Array
+
+
+def identify_torques(
+    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, physical: bool, robust: bool
+) -> Identification:
+    """Estimate parameters in which torques are linear (InputError)."""
+    regressor = TorqueRegressor(mechanism, parameters)
+    warnings: list[str] = []
+    with one_blas_thread(with_scipy=True):
+        equations = [_equations(mechanism, regressor, record, warnings) for record in records]
+        fitted = [x for x in equations if not x.record.validation]
+        columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
+        if right.size < columns.shape[2]:
+            raise InputError(
+                f"identify: {right.size} equations for {columns.shape[2]} unknowns; record a longer motion or estimate "
+                "less"
+            )
+        fit = fit_linear(columns, right, robust=robust)
+        step = fit.x
+        if physical:
+            step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
+    motions = [_prediction(x, mechanism.motors.names, step, fit) for x in equations]
+    return make_result(
+        "torques", regressor, fit, regressor.start + regressor.scale * step, motions, leak=LEAK_TOLERANCE,
+        complete=physical, instants=len(right), warnings=warnings,
+    )  # fmt: skip
+
+
+def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> _Equations:
+    """Estimate the motion of a record, and set up its equations."""
+    names = [name for name in mechanism.coordinates if name in record.values]
+    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
+    missing = [name for name in torques if name not in record.values]
+    if len(names) < mechanism.d or missing:
+        required = missing or list(mechanism.independent)
+        raise InputError(
+            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torque of "
+            f"every motor are needed, there are {', '.join(record.values) or 'none'}"
+        )
+    require_radians(mechanism, record, names)
+    fits = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in names}
+    tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
+    times = record.times(torques[0]) if torques else record.t
+    used = np.all(np.isfinite(tau), axis=1)
+    limit = mechanism.motors.torque_limit
+    saturated = np.any((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=1) & used
+    if saturated.sum() > MAX_SATURATED * used.sum():
+        raise InputError(
+            f"identify: {record.source}: a motor is at its torque limit most of the time; record a slower motion"
+        )
+    if saturated.any():
+        warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
+    at = np.flatnonzero(used & ~saturated)
+    at = at[:: max(1, -(-len(at) // MAX_INSTANTS))]
+    first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
+    motion, _ = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
+    tau = tau[at][np.isin(times[at], motion.t)]
+    columns, force = regressor.rows(motion)
+    to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
+    right = np.einsum("kdm,km->kd", to_forces, tau) - force
+    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau)
+
+
+def _prediction(equations: _Equations, motors: Sequence[str], step: Array, fit: LinearFit) -> Prediction:
+    """Return measured and predicted motor torques."""
+    residual = np.einsum("kmd,kd->km", equations.to_motors, equations.right - equations.columns @ step)
+    names = tuple(f"tau.{motor}" for motor in motors)
+    variances = {name: _expected_variance(equations, k, name, fit) for k, name in enumerate(names)}
+    record, tau = equations.record, equations.tau
+    return Prediction(record.source, record.validation, names, equations.motion.t, tau, tau - residual, variances)
+
+
+def _expected_variance(equations: _Equations, k: int, name: str, fit: LinearFit) -> float:
+    """Return the variance of a motor's torque residual: as given, or as the fit estimated it."""
+    std = equations.record.noise.get(name)
+    if std is not None:
+        return std**2
+    to_motor = equations.to_motors[:, k]
+    return float(np.mean(np.einsum("kd,de,ke->k", to_motor, fit.noise, to_motor)))
