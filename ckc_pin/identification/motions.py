@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,10 +23,18 @@ from ckc_pin.identification.fit import HUBER, LinearFit, fit_linear
 from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_spline
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.unknowns import INERTIAL, Unknown, Unknowns, expand_names, moment_unknowns, typical_size
+from ckc_pin.identification.unknowns import (
+    INERTIAL,
+    ParameterValue,
+    Unknown,
+    Unknowns,
+    expand_names,
+    moment_unknowns,
+    typical_size,
+)
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
-from ckc_pin.mechanism.parameters import with_components
+from ckc_pin.mechanism.parameters import AXES, with_components
 from ckc_pin.mechanism.units import parameter_unit
 from ckc_pin.run.columns import list_quantities
 from ckc_pin.scene.scene import Scene
@@ -37,9 +46,9 @@ RTOL = 1e-10  # of runs
 COLUMN_TOLERANCE = 1e-7  # of the sensitivities' largest singular value: smaller ones are errors of the integration
 LEAK_TOLERANCE = 1e-5  # part of a gradient in directions that are not determined
 NOISE_FLOOR = 1e-9  # of the size of a coordinate: smaller residuals are errors of the integration
-EXACT = 100.0  # residuals up to so many of these floors need no smaller ones
+EXACT = 10.0  # residuals up to so many of these floors need no smaller ones
 MAX_STEPS = 60
-MIN_STEP_SIZE = 1e-3  # part of a Gauss-Newton step
+STEP_SIZES = 0.5 ** np.arange(11)  # parts of a Gauss-Newton step that are tried
 COST_TOLERANCE = 1e-6  # relative: a smaller decrease of the cost ends the fit
 FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records
 PROMISING = 1e-3  # part of the cost by which the linear model says that it can still decrease
@@ -117,9 +126,12 @@ def identify_motion(
         fit = _Fit(unknowns, fitted, unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0)), robust=robust)
         fit.solve()
         others = [_follow(unknowns, x, fit.x, robust=robust) for x in motions if x.record.validation]
-    predictions = [x for part in (fit, *others) for x in part.predictions()]
-    for x in predictions[: len(fitted)]:
-        warnings += list(_misfits(x, fitted))
+    predictions = fit.predictions({})
+    for prediction, motion in zip(predictions, fitted, strict=True):
+        warnings += list(_misfits(prediction, motion))
+    names = dict.fromkeys(name for x in predictions for name in x.quantities)
+    noise = {name: np.mean([x.variances[name] for x in predictions if name in x.variances]) ** 0.5 for name in names}
+    predictions += [x for other in others for x in other.predictions(noise)]
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
         complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
@@ -133,10 +145,9 @@ def _follow(unknowns: Unknowns, motion: _Motion, x: Array, *, robust: bool) -> _
     return fit
 
 
-def _misfits(prediction: Prediction, motions: Sequence[_Motion]) -> Iterator[str]:
+def _misfits(prediction: Prediction, motion: _Motion) -> Iterator[str]:
     """Yield warnings about residuals that are much larger than the noise which the splines see."""
-    splines = next(x.splines for x in motions if x.record.source == prediction.source)
-    for name, spline in splines.items():
+    for name, spline in motion.splines.items():
         k = prediction.quantities.index(name)
         rms = float(np.sqrt(np.nanmean((prediction.measured[:, k] - prediction.predicted[:, k]) ** 2)))
         noise = max(spline.noise, NOISE_FLOOR)
@@ -187,6 +198,15 @@ def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _
     names = [name for name in record.values if name not in torques]
     t = np.array([record.times(name) for name in names]).T
     values = np.array([record.values[name] for name in names]).T
+    series = {} if missing else {name: _measured(record, name) for name in torques}
+    begin, end = (max((x[0] for x, _ in series.values()), default=-np.inf),
+                  min((x[-1] for x, _ in series.values()), default=np.inf))  # fmt: skip
+    outside = np.isfinite(values) & ((t < begin) | (t > end))
+    if outside.any():
+        warnings.append(
+            f"{record.source}: {outside.sum()} values before the first or after the last torque are left out"
+        )
+    values = np.where(outside, np.nan, values)
     first = float(t[np.isfinite(values)].min(initial=np.inf))
     chosen = list(mechanism.independent)
     if not set(chosen) <= set(coordinates):
@@ -195,19 +215,23 @@ def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _
         chosen = [coordinates[k] for k in np.sort(order[: mechanism.d])]
     splines = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in chosen}
     q, q_dot = estimate_start(mechanism, splines, first)
-    controller = None if missing or not torques else _recorded_torques(record, torques, first, float(t.max()))
+    controller = _interpolated(list(series.values()), first) if series else None
     return _Motion(record, names, t - first, values, controller, q, q_dot, splines)
 
 
-def _recorded_torques(record: Record, torques: Sequence[str], first: float, last: float) -> RecordedTorques:
-    """Return the torques of a run from the first measurement on, interpolated linearly, also over gaps."""
-    measured = {name: np.isfinite(record.values[name]) for name in torques}
-    empty = next((name for name, x in measured.items() if not x.any()), None)
-    if empty is not None:
-        raise InputError(f"identify: {record.source}: {empty} has no value; give the torque, 0 if there is none")
-    times = np.unique(np.concatenate([[first, last], *(record.times(name)[x] for name, x in measured.items())]))
-    times = times[(times >= first) & (times <= last)]
-    columns = [np.interp(times, record.times(name)[x], record.values[name][x]) for name, x in measured.items()]
+def _measured(record: Record, name: str) -> tuple[Array, Array]:
+    """Return times and values of a torque without gaps (InputError)."""
+    measured = np.isfinite(record.values[name])
+    if measured.sum() < 2:
+        raise InputError(f"identify: {record.source}: {name} has no values; give the torque, 0 if there is none")
+    return record.times(name)[measured], record.values[name][measured]
+
+
+def _interpolated(series: Sequence[tuple[Array, Array]], first: float) -> RecordedTorques:
+    """Return torques over time from the first measurement on, interpolated linearly, also over gaps."""
+    times = np.unique(np.concatenate([[first], *(times for times, _ in series)]))
+    times = times[times >= first]
+    columns = [np.interp(times, *one) for one in series]
     return RecordedTorques(times - first, np.array(columns).T, interpolates=True)
 
 
@@ -231,7 +255,7 @@ def _simulate(unknowns: Unknowns, motion: _Motion, x: Array, q: Array, q_dot: Ar
             mechanism, t_end=max(float(instants[-1]), 1e-9), formulation="dae", controller=motion.controller,
             initial={"q": dict(zip(mechanism.coordinates, q.tolist(), strict=True)),
                      "q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))},
-            parameters={p.name: p.value for p in parameters}, solver={"rtol": RTOL, "atol": RTOL / 10},
+            parameters=_overrides(mechanism, parameters), solver={"rtol": RTOL, "atol": RTOL / 10},
         )  # fmt: skip
         result = sensitivities(scene, [*(p.name for p in parameters), *start], instants=instants)
     except CkcError as error:
@@ -244,6 +268,16 @@ def _simulate(unknowns: Unknowns, motion: _Motion, x: Array, q: Array, q_dot: Ar
     gradients = np.array([p.gradient for p in parameters]).reshape(len(parameters), -1)
     by_unknown = slopes[:, :, : len(parameters)] @ gradients * unknowns.scale
     return _Run(result.run.q_tree[0], q_dot, predicted, by_unknown, slopes[:, :, len(parameters) :])
+
+
+def _overrides(mechanism: Mechanism, parameters: Sequence[ParameterValue]) -> dict[str, Any]:
+    """Return the values of parameters, as vectors where the mechanism was built with this vector."""
+    values: dict[str, Any] = {p.name: p.value for p in parameters}
+    for name, vector in mechanism.overrides.items():
+        components = [f"{name}.{axis}" for axis in AXES]
+        if isinstance(vector, tuple) and any(x in values for x in components):
+            values[name] = tuple(values.pop(x, old) for x, old in zip(components, vector, strict=True))
+    return values
 
 
 def _outputs(result: Sensitivities, names: Sequence[str], index: IntArray) -> tuple[Array, Array]:
@@ -309,7 +343,11 @@ class _Fit:
                 f"identify: {whole[0].record.source}: no run from the start values reaches the last measurement: "
                 f"{error}; give better start values, or a shorter span"
             )
-        self._iterate(COST_TOLERANCE)
+        if reason := self._iterate(COST_TOLERANCE):
+            raise NumericalError(
+                f"identify: the fit of runs did not converge: {reason}; the rms residuals are {self._rms_residuals()}; "
+                "give better start values, or a shorter span"
+            )
 
     def _begin(self) -> _RunError | None:
         try:
@@ -328,32 +366,30 @@ class _Fit:
                 return True
         return False
 
-    def _iterate(self, tolerance: float) -> None:
-        """Take steps until the cost no longer decreases."""
+    def _iterate(self, tolerance: float) -> str:
+        """Take steps until the cost no longer decreases, and return why it is no minimum, "" if it is one."""
         for _ in range(MAX_STEPS):
             stds = [self._stds(k, self.runs[k]) for k in range(len(self.motions))]
             dx, start_steps = self._step(stds)
-            cost, size, reason = self._cost(self.runs, stds), 1.0, ""
-            while size >= MIN_STEP_SIZE:
+            cost, decrease, reason = self._cost(self.runs, stds), 0.0, ""
+            promised = cost - self._linear_cost(stds, dx, start_steps)
+            is_last = promised <= tolerance * cost or self._is_exact()
+            for size in (1.0,) if is_last else STEP_SIZES:
                 x = self.x + size * dx
-                starts = [
-                    self._moved(run, size * start_step) for run, start_step in zip(self.runs, start_steps, strict=True)
-                ]
+                starts = [self._moved(run, size * step) for run, step in zip(self.runs, start_steps, strict=True)]
                 try:
                     runs = self._simulate(x, starts)
                 except _RunError as error:
                     reason = str(error)
                 else:
                     if (decrease := cost - self._cost(runs, stds)) > 0:
+                        self.x, self.starts, self.runs = x, starts, runs
                         break
-                size /= 2
-            else:
-                self._require_minimum(stds, dx, start_steps, reason)
-                return
-            self.x, self.starts, self.runs = x, starts, runs
-            if decrease <= tolerance * cost:
-                return
-        raise NumericalError(f"identify: the fit of runs did not converge in {MAX_STEPS} steps; {self._reached()}")
+            if is_last or decrease <= tolerance * cost:
+                return (
+                    "" if promised <= PROMISING * cost or is_last else reason or "no step makes the residuals smaller"
+                )
+        return f"{MAX_STEPS} steps were not enough"
 
     def _moved(self, run: _Run, start_step: Array) -> tuple[Array, Array]:
         d = len(self.at)
@@ -361,25 +397,25 @@ class _Fit:
         q[self.at] += start_step[:d]
         return q, run.q_dot + start_step[d:]
 
-    def _require_minimum(self, stds: Sequence[Array], dx: Array, start_steps: Sequence[Array], reason: str) -> None:
-        """Refuse a fit that cannot go on although the linear model promises a smaller cost."""
-        now, predicted, exact = self._cost(self.runs, stds), 0.0, True
-        for k, (motion, run, start_step) in enumerate(zip(self.motions, self.runs, start_steps, strict=True)):
-            moved = replace(run, predicted=run.predicted + run.by_unknown @ dx + run.by_start @ start_step)
-            predicted += self._cost_of(motion, moved, stds[k])
-            exact = exact and bool(np.nanmax(np.abs(motion.values - run.predicted) / self.floors[k]) <= EXACT)
-        if now - predicted > PROMISING * now and not exact:
-            raise NumericalError(
-                f"identify: the fit of runs stopped where no step makes the residuals smaller; {self._reached()}"
-                + (f"; the last step failed: {reason}" if reason else "")
-            )
+    def _linear_cost(self, stds: Sequence[Array], dx: Array, start_steps: Sequence[Array]) -> float:
+        """Return the cost after a step by the linear model."""
+        runs = [
+            replace(run, predicted=run.predicted + run.by_unknown @ dx + run.by_start @ step)
+            for run, step in zip(self.runs, start_steps, strict=True)
+        ]
+        return self._cost(runs, stds)
 
-    def _reached(self) -> str:
+    def _is_exact(self) -> bool:
+        """Whether the residuals are errors of the integration."""
+        parts = zip(self.motions, self.runs, self.floors, strict=True)
+        return all(np.nanmax(np.abs(motion.values - run.predicted) / floor) <= EXACT for motion, run, floor in parts)
+
+    def _rms_residuals(self) -> str:
         texts = []
         for motion, run in zip(self.motions, self.runs, strict=True):
             rms = np.sqrt(np.nanmean((motion.values - run.predicted) ** 2, axis=0))
             texts += [f"{name} {x:.3g}" for name, x in zip(motion.names, rms, strict=True)]
-        return f"the rms residuals are {', '.join(texts)}; give better start values, or a shorter span"
+        return ", ".join(texts)
 
     def _stds(self, k: int, run: _Run) -> Array:
         """Return the standard deviations by which a record's residuals are divided, (quantities,)."""
@@ -444,16 +480,17 @@ class _Fit:
             )
         return dx, start_steps
 
-    def predictions(self) -> list[Prediction]:
-        """Return measured and predicted quantities of the records."""
+    def predictions(self, expected: Mapping[str, float]) -> list[Prediction]:
+        """Return measured and predicted quantities, with the noise of the record, as expected, or of the residuals."""
         predictions = []
         for k, (motion, run) in enumerate(zip(self.motions, self.runs, strict=True)):
-            stds = self._stds(k, run)
-            noise = [motion.record.noise.get(name, std) for name, std in zip(motion.names, stds, strict=True)]
-            variances = {name: float(std) ** 2 for name, std in zip(motion.names, noise, strict=True)}
-            predicted = np.where(np.isfinite(motion.values), run.predicted, np.nan)
+            stds = dict(zip(motion.names, self._stds(k, run).tolist(), strict=True))
+            noise = {**stds, **expected, **motion.record.noise}
             predictions.append(
-                Prediction(motion.record.source, motion.record.validation, tuple(motion.names), motion.record.t,
-                           motion.values, predicted, variances)
+                Prediction(
+                    motion.record.source, motion.record.validation, tuple(motion.names), motion.record.t, motion.values,
+                    np.where(np.isfinite(motion.values), run.predicted, np.nan),
+                    {name: noise[name] ** 2 for name in motion.names},
+                )
             )  # fmt: skip
         return predictions
