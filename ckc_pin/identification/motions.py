@@ -125,12 +125,16 @@ def identify_motion(
         none = np.zeros((len(unknowns.names), 0))
         fit = _Fit(unknowns, fitted, unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0)), robust=robust)
         fit.solve()
-        others = [_follow(unknowns, x, fit.x, robust=robust) for x in motions if x.record.validation]
+        others = [_Fit(unknowns, [x], fit.x, robust=robust, starts_only=True) for x in motions if x.record.validation]
+        for other in others:
+            other.solve()
     predictions = fit.predictions({})
     for prediction, motion in zip(predictions, fitted, strict=True):
         warnings += list(_misfits(prediction, motion))
     names = dict.fromkeys(name for x in predictions for name in x.quantities)
-    noise = {name: np.mean([x.variances[name] for x in predictions if name in x.variances]) ** 0.5 for name in names}
+    noise = {
+        name: float(np.mean([x.variances[name] for x in predictions if name in x.variances])) ** 0.5 for name in names
+    }
     predictions += [x for other in others for x in other.predictions(noise)]
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
@@ -138,18 +142,11 @@ def identify_motion(
     )  # fmt: skip
 
 
-def _follow(unknowns: Unknowns, motion: _Motion, x: Array, *, robust: bool) -> _Fit:
-    """Fit the start of a record only."""
-    fit = _Fit(unknowns, [motion], x, robust=robust, starts_only=True)
-    fit.solve()
-    return fit
-
-
 def _misfits(prediction: Prediction, motion: _Motion) -> Iterator[str]:
     """Yield warnings about residuals that are much larger than the noise which the splines see."""
     for name, spline in motion.splines.items():
         k = prediction.quantities.index(name)
-        rms = float(np.sqrt(np.nanmean((prediction.measured[:, k] - prediction.predicted[:, k]) ** 2)))
+        rms = float(_rms(prediction.measured - prediction.predicted)[k])
         noise = max(spline.noise, NOISE_FLOOR)
         if rms > SUSPICIOUS * noise and rms > SUSPICIOUS_RMS:
             yield (
@@ -195,7 +192,7 @@ def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _
     if missing:
         warnings.append(f"{record.source}: no torques were recorded, so the motors count as unpowered")
     require_radians(mechanism, record, coordinates)
-    names = [name for name in record.values if name not in torques]
+    names = [name for name, x in record.values.items() if name not in torques and np.isfinite(x).any()]
     t = np.array([record.times(name) for name in names]).T
     values = np.array([record.values[name] for name in names]).T
     series = {} if missing else {name: _measured(record, name) for name in torques}
@@ -287,6 +284,12 @@ def _outputs(result: Sensitivities, names: Sequence[str], index: IntArray) -> tu
     return np.array(columns).T, np.array(slopes).transpose(1, 0, 2)
 
 
+def _rms(residual: Array) -> Array:
+    """Return the root mean square of each column, of the values that are no gaps; 0 if there is none."""
+    count = np.isfinite(residual).sum(axis=0)
+    return np.sqrt(np.nansum(residual**2, axis=0) / np.maximum(count, 1))
+
+
 # --- least squares ---------------------------------------------------------------------------------
 
 
@@ -361,7 +364,7 @@ class _Fit:
 
     def _is_lost(self) -> bool:
         for motion, run in zip(self.motions, self.runs, strict=True):
-            rms = np.sqrt(np.nanmean((motion.values - run.predicted) ** 2, axis=0))
+            rms = _rms(motion.values - run.predicted)
             if np.any(rms > LOST * np.nanstd(motion.values, axis=0)):
                 return True
         return False
@@ -413,7 +416,7 @@ class _Fit:
     def _rms_residuals(self) -> str:
         texts = []
         for motion, run in zip(self.motions, self.runs, strict=True):
-            rms = np.sqrt(np.nanmean((motion.values - run.predicted) ** 2, axis=0))
+            rms = _rms(motion.values - run.predicted)
             texts += [f"{name} {x:.3g}" for name, x in zip(motion.names, rms, strict=True)]
         return ", ".join(texts)
 
@@ -424,10 +427,12 @@ class _Fit:
         count = np.isfinite(residual).sum(axis=0)
         used = 2 * len(self.at) + (0 if self.starts_only else len(self.unknowns.names) / len(self.motions))
         free = max(1 - used / count.sum(), 1 / count.sum())
+        estimate = _rms(residual) / free**0.5
         if self.robust:
-            estimate = np.nanmedian(np.abs(residual), axis=0) / MEDIAN
-        else:
-            estimate = np.sqrt(np.nanmean(residual**2, axis=0) / free)
+            estimate = (
+                np.array([np.median(np.abs(x[np.isfinite(x)])) if np.isfinite(x).any() else 0.0 for x in residual.T])
+                / MEDIAN
+            )
         noise = [motion.record.noise.get(name, 0.0) for name in motion.names]
         return np.maximum(np.maximum(estimate, noise), self.floors[k])
 

@@ -80,8 +80,8 @@ def test_exact_free_swing_gives_a_length_with_inertias():
 
 def test_exact_driven_motion_gives_the_same_base_parameters_as_torques_do():
     data = measure(run_five_bar(0.8, driven=True), driven=True)
-    known = {name: value for name, value in TRUE.items() if name.endswith("damping")}
-    start = load("five_bar", {**known, "link.link_1.mass": 0.2, "link.link_3.mass": 0.3})
+    dampings = {name: value for name, value in TRUE.items() if name.endswith("damping")}
+    start = load("five_bar", {**dampings, "link.link_1.mass": 0.2, "link.link_3.mass": 0.3})
     result = identify(start, data, ["link.*.inertial", "joint.*.friction"], method="motion")
     truth = TorqueRegressor(load("five_bar", TRUE), ["link.*.inertial", "joint.*.friction"])
     values = dict(zip(truth.names, truth.start, strict=True))
@@ -96,8 +96,8 @@ def test_scale_of_all_masses_is_not_told_by_a_free_swing():
     result = identify(load("five_bar", TRUE), measure(run_five_bar()), names, method="motion")
     assert {x.verdict for x in result.parameters.values()} == {"only in a combination"}
     assert len(result.base) == len(result.parameters) - 1 == 9
-    known = identify(load("five_bar", TRUE), measure(run_five_bar()), names[1:], method="motion")
-    assert {x.verdict for x in known.parameters.values()} == {"identified"}
+    relative = identify(load("five_bar", TRUE), measure(run_five_bar()), names[1:], method="motion")
+    assert {x.verdict for x in relative.parameters.values()} == {"identified"}
 
 
 @pytest.mark.parametrize("driven", [False, True])

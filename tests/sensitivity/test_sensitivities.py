@@ -179,3 +179,15 @@ def test_a_start_at_the_equilibrium(tmp_path: Path) -> None:
         expected = (16 * (4 * four - two) - (4 * two - one)) / 45
         assert np.abs(result.q_tree[0, :, k] - expected).max() <= 1e-7 * np.abs(expected).max(), name
         assert np.abs(result.q_tree[-1, :, k] - expected).max() <= 1e-7 * np.abs(expected).max(), name
+
+
+def test_output_instants_of_the_caller(tmp_path: Path) -> None:
+    scene = write_four_bar(tmp_path / "x", formulation="dae")
+    all_instants = sensitivities(scene, SOME, TIGHT)
+    some = [0, 3, 4, 9]
+    result = sensitivities(scene, SOME, TIGHT, instants=all_instants.t[some])
+    assert np.array_equal(result.t, all_instants.t[some])
+    assert np.abs(result.q_tree - all_instants.q_tree[some]).max() <= 1e-12
+    for instants in ([], [0.1, 0.2], [0.0, 0.2, 0.2], [0.0, 1e9], [0.0, np.nan]):
+        with pytest.raises(InputError, match="instants: expected increasing times from 0 to at most t_end"):
+            sensitivities(scene, SOME, TIGHT, instants=instants)
