@@ -67,8 +67,8 @@ def _draw_predictions(result: Identification) -> Figure:
     figure.suptitle(f"{escape_mathtext(motion.source)}, {kind}", x=0.01, ha="left", fontweight="bold")
     stride = max(1, len(motion.t) // POINTS)
     for ax, label, measured, predicted in zip(panels, labels, motion.measured.T, motion.predicted.T, strict=True):
-        ax.plot(motion.t[::stride], measured[::stride], color=style.COLOURS[0], linewidth=0.8, label="measured")
         ax.plot(motion.t[::stride], predicted[::stride], color=style.COLOURS[1], linewidth=1.2, label="predicted")
+        ax.plot(motion.t[::stride], measured[::stride], ".", color=style.COLOURS[0], markersize=2, label="measured")
         ax.set_ylabel(label)
     panels[0].legend(loc="upper right", ncols=2, fontsize=8)
     panels[-1].set_xlabel("time [s]")

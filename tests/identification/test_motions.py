@@ -91,7 +91,7 @@ def test_exact_driven_motion_gives_the_same_base_parameters_as_torques_do():
     assert result.physical
 
 
-def test_scale_of_all_masses_is_not_told_by_a_free_swing():
+def test_free_motion_under_gravity_does_not_tell_the_scale_of_all_masses():
     names = ["link.link_1.mass", "link.link_2.mass", "link.link_3.mass", "link.link_4.mass", *DISSIPATION]
     result = identify(load("five_bar", TRUE), measure(run_five_bar()), names, method="motion")
     assert {x.verdict for x in result.parameters.values()} == {"only in a combination"}
