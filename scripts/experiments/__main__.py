@@ -169,6 +169,9 @@ def benchmark(
         list[str] | None,
         typer.Option(metavar="COMMAND", help="a program to add, as docs/report/peers.md explains; repeatable"),
     ] = None,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="first install programs that need an environment of their own")
+    ] = False,
 ) -> None:
     """Measure error against run time, here and in other programs.
 
@@ -179,6 +182,11 @@ def benchmark(
 
     if page and peer:
         raise typer.BadParameter("--page measures nothing, so it adds no --peer; leave one of them out")
+    if peers:
+        from scripts.experiments.benchmark.peers.environments import PROGRAMS, make_environment
+
+        for program in PROGRAMS:
+            print(make_environment(program), flush=True)
     folder = out or (Path("out/report") if peer else DOCS / "report")
     for path in make.report(folder, quick=quick, from_tables=page, added=add_programs(peer or ())):
         print(f"written: {path}")
