@@ -25,7 +25,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
-from timing import fixed_step, print_motion, say
+from timing import fixed_step, print_motion, read_inertia, say
 
 # CENIC is Drake's integrator with error control that takes constraints. "loop joints": the plant splits a link of each
 # loop itself. SAP has a fixed step. Runge-Kutta would drop constraints without a word, so bushings replace them.
@@ -82,9 +82,9 @@ class Plant:
         self.force[self.v_at] = problem["joints"]["force"]
 
     def _add(self, k: int, body: dict[str, Any]) -> None:
-        name, inertia = body["name"], np.array(body["inertia"])
+        name, (mass, inertia) = body["name"], read_inertia(body)
         moments = RotationalInertia(*inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-        spatial = SpatialInertia.MakeFromCentralInertia(body["mass"], body["center"], moments)
+        spatial = SpatialInertia.MakeFromCentralInertia(mass, body["center"], moments)
         added = self.plant.AddRigidBody(f"{name} body", spatial)
         frame = self._frame(f"{name} frame", body["parent"], read_pose(body))
         at = sum(6 if other["joint"] == "free" else 1 for other in self.problem["bodies"][:k])
@@ -237,15 +237,13 @@ def find_unsupported(problem: dict[str, Any]) -> str:
     """Return what the plant lacks for a problem; empty if nothing."""
     if problem["pairs"] is None:
         return "loops that are no points, hinges or welds are not set up in it"
-    if any(body["mass"] <= 0 for body in problem["bodies"]):
-        return "it has no bodies without mass"
     if any(problem["joints"]["armature"]):
         return "armature is not set up in it"
     on_slides = zip(problem["bodies"], problem["joints"]["stiffness"], strict=False)
     if any(stiffness and body["joint"] != "revolute" for body, stiffness in on_slides):
         return "a spring on a prismatic joint has no counterpart in it"
-    if problem["setting"].endswith("bushings") and not problem["pairs"]:
-        return "it has no loops for bushings"
+    if problem["setting"].endswith(("bushings", "joints")) and not problem["pairs"]:
+        return "it has no loops"
     return ""
 
 
@@ -256,18 +254,18 @@ def main() -> None:
     unsupported = find_unsupported(problem)
     if unsupported:
         return say(unsupported=unsupported)
-    try:
-        tree = Plant(problem, 0.0, "open")
-    except RuntimeError as error:
-        return say(unsupported=" ".join(str(error).split()))
-    if not problem["instants"]:
-        return say(acceleration=tree.acceleration())
     setting, rtol, step = problem["setting"], problem["rtol"], 0.0
     if setting == "SAP":
         step = fixed_step(problem, COARSEST_S)[1]
-    stiffness = BUSHING_N_PER_M / rtol
     loops = {"RungeKutta3, bushings": "bushings", "CENIC, loop joints": "joints"}.get(setting, "constraints")
-    plant, running = Plant(problem, step, loops, stiffness, tree), dict[str, Any]()
+    try:
+        tree = Plant(problem, 0.0, "open")
+        if not problem["instants"]:
+            return say(acceleration=tree.acceleration())
+        plant = Plant(problem, step, loops, BUSHING_N_PER_M / rtol, tree)
+    except RuntimeError as error:
+        return say(unsupported=" ".join(str(error).split()))
+    running = dict[str, Any]()
 
     def reset() -> None:
         simulator = Simulator(plant.plant, plant.start())

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-from timing import fixed_step, print_motion, say
+from timing import fixed_step, print_motion, read_inertia, say
 
 SETTINGS = ("RK4, solref 4 dt", "RK4, solref 2 dt", "implicitfast, solref 2 dt", "Euler, solref 2 dt")
 COARSEST_S = 2e-2  # step at the tolerance 1e-2
@@ -44,10 +44,9 @@ def build_model(problem: dict[str, Any]) -> Any:
     for body in problem["bodies"]:
         pose = {"pos": text(body["translation"]), "quat": text(quaternion(body["rotation"]))}
         added = ElementTree.SubElement(bodies[body["parent"]], "body", pose)
-        inertia = text(np.array(body["inertia"])[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-        ElementTree.SubElement(
-            added, "inertial", pos=text(body["center"]), mass=text(body["mass"]), fullinertia=inertia
-        )
+        mass, inertia = read_inertia(body)
+        full = text(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+        ElementTree.SubElement(added, "inertial", pos=text(body["center"]), mass=text(mass), fullinertia=full)
         if body["joint"] == "free":
             ElementTree.SubElement(added, "freejoint")
         else:

@@ -6,9 +6,13 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 MAX_REPEATS, REPEAT_BELOW_S = 3, 0.5  # of short runs
 TRIAL_INSTANTS = 0.01  # part of the interval between two instants from which the time of a run is estimated
 TRIAL_BUDGET = 0.02  # part of the budget from which an estimate counts
+
+MIN_MASS = 1e-12  # kg and kg m^2: massless bodies are given this mass, because MuJoCo and Drake take none without
 
 State = tuple[list[float], list[float]]  # q and v of the protocol
 
@@ -16,6 +20,13 @@ State = tuple[list[float], list[float]]  # q and v of the protocol
 def say(**values: Any) -> None:
     """Print one line of the protocol."""
     print(json.dumps(values), flush=True)
+
+
+def read_inertia(body: dict[str, Any]) -> tuple[float, Any]:
+    """Return a body's mass and inertia, raised to `MIN_MASS`."""
+    inertia = np.array(body["inertia"])
+    smallest = np.linalg.eigvalsh(inertia)[0]
+    return max(body["mass"], MIN_MASS), inertia + max(MIN_MASS - smallest, 0.0) * np.eye(3)
 
 
 def fixed_step(problem: dict[str, Any], coarsest: float) -> tuple[int, float]:
