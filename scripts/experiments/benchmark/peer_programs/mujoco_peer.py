@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from timing import fixed_step, print_motion, read_inertia, say
 
-SETTINGS = ("RK4, solref 4 dt", "RK4, solref 2 dt", "implicitfast, solref 2 dt", "Euler, solref 2 dt")
+SETTINGS = ("RK4, solref 4 dt", "RK4, solref 2 dt", "implicitfast, solref 2 dt")
 COARSEST_S = 2e-2  # step at the tolerance 1e-2
 STIFFEST_SOLIMP = [0.9999, 0.9999, 0.001, 0.5, 2.0]  # of constraints; the manual's limit of solref is 2 dt
 DISABLED = ("AUTORESET", "CONTACT", "SENSOR")  # AUTORESET would restart a run that diverged

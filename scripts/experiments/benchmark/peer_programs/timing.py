@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-MAX_REPEATS, REPEAT_BELOW_S = 3, 0.5  # of short runs
+MAX_REPEATS, REPEAT_BELOW_S = 3, 0.2  # of short runs
 TRIAL_INSTANTS = 0.01  # part of the interval between two instants from which the time of a run is estimated
 TRIAL_BUDGET = 0.02  # part of the budget from which an estimate counts
 

@@ -43,7 +43,8 @@ class ProgramPeer:
     command : str
         Command line. Files that it names are part of the key under which its runs are stored.
     expected : str, optional
-        Name of a program of this project. Its text is part of every key, so its version has no digest.
+        Name of a program of this project. Its text is part of every key, so its version has no digest. Its errors fall
+        slowly with the tolerance, so every second one is enough.
 
     Raises
     ------
@@ -73,8 +74,9 @@ class ProgramPeer:
         return self._version if self._expected or not self._digest else f"{self._version} ({self._digest})"
 
     def settings(self, work: Work, quick: bool) -> Iterator[str]:
+        tolerances = TOLERANCES[::2] if self._expected else TOLERANCES
         for setting in self._settings:
-            for rtol in QUICK_TOLERANCES if quick else TOLERANCES:
+            for rtol in QUICK_TOLERANCES if quick else tolerances:
                 yield f"{setting}, rtol {rtol:.0e}".removeprefix(", ")
 
     def check(self, work: Work) -> str:
