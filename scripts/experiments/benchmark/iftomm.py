@@ -23,7 +23,7 @@ from scripts.experiments.benchmark.reference import reference
 from scripts.experiments.benchmark.stamp import machine, versions
 from scripts.experiments.benchmark.work import INSTANTS, WORKS, Work
 
-__all__ = ["PROBLEMS", "Problem", "write_solutions"]
+__all__ = ["PROBLEMS", "IftommProblem", "write_solutions"]
 
 RTOL = 1e-10
 WIDTH = 23  # characters of a column
@@ -31,7 +31,7 @@ REPEATS = 5  # of a run, for its processor time
 
 
 @dataclass(frozen=True)
-class Problem:
+class IftommProblem:
     """A problem of the library.
 
     Attributes
@@ -75,15 +75,15 @@ def _end_of_crank(work: Work, q_tree: Array) -> Array:
 
 
 PROBLEMS = (
-    Problem("A01", "simple pendulum", "pendulum", 0.01, ("X", "Y"), _point("P1", 2)),
-    Problem("A02", "N-four-bar mechanism, N = 2", "n_four_bar_2", 0.01, ("X", "Y"), _point("B0", 2)),
-    Problem("A03", "Andrews' mechanism", "andrews", 0.00025, ("X", "Y"), _end_of_crank),
-    Problem("A04", "Bricard's mechanism", "bricard", 0.01, ("X", "Y", "Z"), _point("P3", 3)),
-    Problem("A05", "stiff flyball governor", "flyball", 0.1, ("S",), _coordinate("slider")),
+    IftommProblem("A01", "simple pendulum", "pendulum", 0.01, ("X", "Y"), _point("P1", 2)),
+    IftommProblem("A02", "N-four-bar mechanism, N = 2", "n_four_bar_2", 0.01, ("X", "Y"), _point("B0", 2)),
+    IftommProblem("A03", "Andrews' mechanism", "andrews", 0.00025, ("X", "Y"), _end_of_crank),
+    IftommProblem("A04", "Bricard's mechanism", "bricard", 0.01, ("X", "Y", "Z"), _point("P3", 3)),
+    IftommProblem("A05", "stiff flyball governor", "flyball", 0.1, ("S",), _coordinate("slider")),
 )
 
 
-def write_solutions(folder: Path, problems: tuple[Problem, ...] = PROBLEMS) -> list[Path]:
+def write_solutions(folder: Path, problems: tuple[IftommProblem, ...] = PROBLEMS) -> list[Path]:
     """Write a result file for each problem, and solutions.csv with accuracy and time; return the files.
 
     Raises

@@ -72,11 +72,13 @@ class Work:
             **{name.replace("__", "."): value for name, value in solver.items()},
         }  # fmt: skip
         return (
-            load_scene(self.scene, overrides) if isinstance(self.scene, str) else self._made.with_overrides(overrides)
+            load_scene(self.scene, overrides)
+            if isinstance(self.scene, str)
+            else self._python_scene.with_overrides(overrides)
         )
 
     @cached_property
-    def _made(self) -> Scene:
+    def _python_scene(self) -> Scene:
         assert callable(self.scene)
         return self.scene()
 

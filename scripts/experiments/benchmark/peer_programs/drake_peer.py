@@ -47,7 +47,7 @@ def read_pose(frame: dict[str, Any]) -> RigidTransform:
     return RigidTransform(RotationMatrix(np.array(frame["rotation"])), frame["translation"])
 
 
-class Plant:
+class ProblemPlant:
     """A problem as a plant: discrete with step dt, or continuous. Loop joints need `tree`, its plant without loops."""
 
     def __init__(
@@ -118,7 +118,7 @@ class Plant:
             bushing = (none, none, stiffness * ones, BUSHING_DAMPING_S * stiffness * ones)
             self.plant.AddForceElement(LinearBushingRollPitchYaw(*ends, *bushing))
 
-    def _join(self, tree: "Plant") -> None:
+    def _join(self, tree: "ProblemPlant") -> None:
         """Close loops by joints at zero. Without an axis, that of the second body's hinge is the plane's normal."""
         context = tree.start()
         for loop in self.problem["loops"]:
@@ -259,10 +259,10 @@ def main() -> None:
         step = fixed_step(problem, COARSEST_S)[1]
     loops = {"RungeKutta3, bushings": "bushings", "CENIC, loop joints": "joints"}.get(setting, "constraints")
     try:
-        tree = Plant(problem, 0.0, "open")
+        tree = ProblemPlant(problem, 0.0, "open")
         if not problem["instants"]:
             return say(acceleration=tree.acceleration())
-        plant = Plant(problem, step, loops, BUSHING_N_PER_M / rtol, tree)
+        plant = ProblemPlant(problem, step, loops, BUSHING_N_PER_M / rtol, tree)
     except RuntimeError as error:
         return say(unsupported=" ".join(str(error).split()))
     running = dict[str, Any]()

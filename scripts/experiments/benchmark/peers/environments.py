@@ -145,9 +145,9 @@ def _pythons(version: str) -> Iterator[str]:
     root = _run("pyenv", "root")
     if root:
         yield from map(str, sorted(Path(root, "versions").glob(f"{version}.*/bin/python"), reverse=True))
-    found = _run("uv", "python", "find", "--no-project", version)
-    if found:
-        yield found
+    path = _run("uv", "python", "find", "--no-project", version)
+    if path:
+        yield path
 
 
 def _run(*command: str) -> str:
