@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
+    from ckc_pin.identification.identify import Identification, identify
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
@@ -80,6 +81,7 @@ __all__ = [
     "Floquet",
     "Force",
     "GainLocus",
+    "Identification",
     "InputError",
     "JointServo",
     "LinearModel",
@@ -105,6 +107,7 @@ __all__ = [
     "explore",
     "floquet",
     "gain_locus",
+    "identify",
     "inverse_dynamics",
     "linearize",
     "load",
@@ -130,6 +133,7 @@ MODULES = {
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
     "GainLocus": "linear.locus",
+    "Identification": "identification.identify",
     "InputError": "errors",
     "JointServo": "control.joint_servo",
     "LinearModel": "linear.linear_model",
@@ -155,6 +159,7 @@ MODULES = {
     "explore": "explorer.explore",
     "floquet": "sensitivity.floquet",
     "gain_locus": "linear.locus",
+    "identify": "identification.identify",
     "inverse_dynamics": "run.inverse",
     "linearize": "linear.linearize",
     "load": "kinematics",
@@ -164,8 +169,8 @@ MODULES = {
     "terms": "dynamics.terms",
 }
 ROOMS = (
-    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats", "kinematics",
-    "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
+    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats",
+    "identification", "kinematics", "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
 )  # fmt: skip
 
 
@@ -242,13 +247,20 @@ def play(
 
 
 def plot(
-    *shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | xarray.Dataset,
+    *shown: Run
+    | LinearModel
+    | GainLocus
+    | Sensitivities
+    | MotionForces
+    | SingularityMap
+    | Identification
+    | xarray.Dataset,
 ) -> Figures:
-    """Draw figures of runs, or of another result: a linear model, a root locus, sensitivities, a map, an ensemble.
+    """Draw figures of runs, or of another result: a linear model, a root locus, sensitivities and others.
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap or xarray.Dataset
+    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, Identification or Dataset
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
         The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
         map over two.

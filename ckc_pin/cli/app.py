@@ -50,6 +50,7 @@ COMMANDS = {
     "linearize": "analyses:linearize",
     "sensitivities": "analyses:sensitivities",
     "sweep": "sweep:sweep",
+    "identify": "identification:identify",
     "plot": "runs:plot",
     "play": "runs:play",
     "map": "analyses:map_",

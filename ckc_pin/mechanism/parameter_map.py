@@ -22,7 +22,14 @@ from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, Value, split_component
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.spec import FrameSpec, MechanismSpec
 
-__all__ = ["ParameterMap", "list_line_springs", "list_loop_frames", "list_spring_ends", "model_numbers"]
+__all__ = [
+    "ParameterMap",
+    "inertial_rotation",
+    "list_line_springs",
+    "list_loop_frames",
+    "list_spring_ends",
+    "model_numbers",
+]
 
 Numbers = NDArray[Any]  # real, or complex for a derivative
 
@@ -365,7 +372,7 @@ class _Members:
             mass = self._value(f"link.{name}.mass")
             centre = translation + _turn(rotation, self._value(f"link.{name}.com"))
             inertia = self._link_inertia(name, mass)
-            parts[body].append((mass, centre, rotation @ _inertial_rotation(inertial), inertia))
+            parts[body].append((mass, centre, rotation @ inertial_rotation(inertial), inertia))
         for body, links in parts.items():
             self._add_body(body, links)
 
@@ -439,7 +446,8 @@ def _rpy_matrix(rpy: Numbers) -> Numbers:
     return matrix
 
 
-def _inertial_rotation(inertial: ElementTree.Element) -> Array:
+def inertial_rotation(inertial: ElementTree.Element) -> Array:
+    """Return the axes of a link's inertial frame in the link's frame, shape (3, 3)."""
     origin = inertial.find("origin")
     return _rpy_matrix(
         np.array([float(x) for x in ("0 0 0" if origin is None else origin.get("rpy", "0 0 0")).split()])

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.errors import InputError
+from ckc_pin.identification.identify import Identification
 from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
@@ -20,6 +21,7 @@ from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view.ensemble_figures import draw_ensemble
 from ckc_pin.view.figures import draw_runs, write_figures
 from ckc_pin.view.gif import FRAMES_PER_SECOND, save_gif
+from ckc_pin.view.identification_figures import draw_identification
 from ckc_pin.view.linear_figures import draw_linear
 from ckc_pin.view.map_figures import draw_map
 from ckc_pin.view.player import render_html, write_page
@@ -29,13 +31,15 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-    Drawable = Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | xarray.Dataset
+    Drawable = (
+        Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | Identification | xarray.Dataset
+    )
 
 __all__ = ["Figures", "Playback"]
 
 PLAYBACK_HEIGHT_PX = 480
 FIGURE_DPI = 100
-DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap)
+DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, Identification)
 
 
 class Figures(Mapping[str, "Figure"]):
@@ -43,7 +47,7 @@ class Figures(Mapping[str, "Figure"]):
 
     Parameters
     ----------
-    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, or Dataset
+    results : sequence of Run, or of one other result that `ckc_pin.plot` takes
         of an ensemble
 
     Raises
@@ -60,6 +64,8 @@ class Figures(Mapping[str, "Figure"]):
                 self._figures = {"sensitivities": draw_sensitivities(result)}
             case [MotionForces() as result]:
                 self._figures = {"inverse": draw_motion_forces(result)}
+            case [Identification() as result]:
+                self._figures = draw_identification(result)
             case [SingularityMap() as result]:
                 self._figures = {f"map_{result.space}": draw_map(result)}
             case [result] if _is_dataset(result):

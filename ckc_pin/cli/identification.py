@@ -1,0 +1,63 @@
+"""The command identify: parameters from measurements."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+
+from ckc_pin.base.atomic_files import lock_folder, write_atomic
+from ckc_pin.base.summary import to_json
+from ckc_pin.cli import options
+from ckc_pin.cli.output import (
+    Spinner,
+    format_destination,
+    make_folder,
+    print_json,
+    print_summary,
+    skip_figures_without_matplotlib,
+)
+from ckc_pin.cli.signals import interrupts
+
+__all__ = ["identify"]
+
+
+@click.command(
+    epilog=options.format_examples(
+        "ckc identify swing.identify.toml",
+        "ckc identify swing.identify.toml --out identified --figures",
+        "ckc identify swing.identify.toml --json",
+    )
+)
+@click.argument(
+    "file", metavar="FILE", type=options.PATH, help="A *.identify.toml: a mechanism, recorded motions, and parameters."
+)
+@options.out(help="Folder for identification.json and parameters.toml.")
+@options.figures
+@options.as_json
+def identify(file: Path, out: Path | None, figures: bool, as_json: bool) -> None:
+    """Estimate parameters from measurements. Coordinates and motor torques of recorded motions are needed."""
+    from ckc_pin.identification.identify import identify_file
+
+    options.require_folder(out, figures)
+    if out is not None:
+        make_folder(out)
+    with Spinner(f"identify {file.name}"):
+        result = identify_file(file)
+    if out is not None:
+        with ExitStack() as stack:
+            with interrupts.deferred():
+                stack.enter_context(lock_folder(out))
+                write_atomic(out / "identification.json", to_json(result.to_dict()) + "\n")
+                result.save(out / "parameters.toml")
+            if figures:
+                from ckc_pin.view.identification_figures import save_identification
+
+                with skip_figures_without_matplotlib():
+                    save_identification(result, out)
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        print_summary(result.summary())
+        print(format_destination(out, "identification.json and parameters.toml"))

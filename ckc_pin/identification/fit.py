@@ -1,0 +1,138 @@
+"""Weighted least squares of equations that are linear in unknowns, and what they determine.
+
+Unknowns are in units of their typical sizes. A direction of the unknowns is determined if its standard deviation is
+smaller than half of such a unit. Every other direction is left out of the solution and of all that is reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable, IntArray
+from ckc_pin.base.linear_algebra import pivoted_columns
+
+__all__ = ["LinearFit", "fit_linear"]
+
+STRUCTURAL_RANK_TOLERANCE = 1e-10  # of the largest singular value: smaller ones are rounding
+MAX_STD = 0.5  # of a determined direction, in typical sizes
+HUBER = 2.5  # standard deviations from which residuals are weighted down
+MAX_PASSES, PASS_TOLERANCE = 30, 1e-6
+WHITE = 0.05  # largest autocorrelation of residuals that count as independent
+MAX_LAG = 0.05  # of the number of instants
+COEFFICIENT_TOLERANCE = 1e-6  # of the largest coefficient of a combination, in typical sizes
+NOISE_FLOOR = 1e-13  # of the largest right-hand side
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit(Immutable):
+    """Solution of columns x = right in the least-squares sense, in typical sizes.
+
+    Attributes
+    ----------
+    x : (p,) array
+        The solution in the determined directions, zero in the others.
+    covariance : (p, p) array
+        Of x.
+    determined : (p, r) array
+        Orthonormal basis of the determined directions.
+    information : (r,) array
+        Inverse standard deviations along these directions for independent residuals.
+    residual : (m, d) array
+    noise : (d, d) array
+        Covariance of the residuals of one instant.
+    correlation_time : int
+        Instants over which residuals are correlated, 0 if they are independent.
+    condition : float
+        Of the columns in the determined directions.
+    rank : int
+        Number of singular values above rounding errors.
+    """
+
+    x: Array
+    covariance: Array
+    determined: Array
+    information: Array
+    residual: Array
+    noise: Array
+    correlation_time: int
+    condition: float
+    rank: int
+
+    def combinations(self) -> tuple[IntArray, Array]:
+        """Return one unknown for each determined direction, and coefficients (r, p) of what is determined.
+
+        Each combination contains its own unknown with coefficient 1, and none of the other chosen ones.
+        """
+        order, _ = pivoted_columns((self.determined * self.information).T)
+        chosen = np.sort(order[: self.determined.shape[1]])
+        coefficients = np.linalg.solve(self.determined[chosen].T, self.determined.T)
+        largest = np.abs(coefficients).max(axis=1, initial=0.0, keepdims=True)
+        return chosen, np.where(np.abs(coefficients) > COEFFICIENT_TOLERANCE * largest, coefficients, 0.0)
+
+
+def fit_linear(columns: Array, right: Array, *, robust: bool = False, noise: Array | None = None) -> LinearFit:
+    """Solve columns x = right, (m, d, p) and (m, d), by iteratively reweighted least squares.
+
+    The d equations of one instant are weighted by the inverse covariance of their residuals, which is estimated. With
+    `robust`, instants with large residuals have less weight (Huber).
+
+    Parameters
+    ----------
+    noise : (m, d, d) array, optional
+        Covariances of the equations that are known; estimated if absent.
+    """
+    m, d, p = columns.shape
+    floor = NOISE_FLOOR * max(float(np.abs(right).max(initial=0.0)), 1e-300)
+    weights, covariance = np.ones(m), np.eye(d)
+    x = np.zeros(p)
+    for _ in range(MAX_PASSES):
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance if noise is None else noise))
+        A = (whitening @ columns) * np.sqrt(weights)[:, None, None]
+        b = np.einsum("...ij,...j->...i", whitening, right) * np.sqrt(weights)[:, None]
+        u, s, v = np.linalg.svd(A.reshape(-1, p), full_matrices=False)
+        rank = int(np.sum(s > STRUCTURAL_RANK_TOLERANCE * max(float(s[0]), 1e-300)))
+        previous, x = x, v[:rank].T @ ((u[:, :rank].T @ b.ravel()) / s[:rank])
+        residual = right - columns @ x
+        if robust:
+            sizes = np.linalg.norm(np.einsum("...ij,...j->...i", whitening, residual), axis=1) / np.sqrt(d)
+            scale = max(float(np.median(sizes)) / 0.6745, 1e-300) if noise is None else 1.0
+            weights = np.minimum(1.0, HUBER * scale / np.maximum(sizes, 1e-300))
+        if noise is None:
+            used = weights.sum() - rank / d
+            covariance = np.einsum("k,ki,kj->ij", weights, residual, residual) / max(used, 1.0) + floor**2 * np.eye(d)
+        if np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and _ > 1:
+            break
+    return _solution(A, b, u, s, v, rank, residual, covariance if noise is None else noise.mean(axis=0))
+
+
+def _solution(A: Array, b: Array, u: Array, s: Array, v: Array, rank: int, residual: Array, noise: Array) -> LinearFit:
+    """Keep the determined directions, and estimate the covariance of x."""
+    p = A.shape[2]
+    keep = int(np.sum(s[:rank] > 1.0 / MAX_STD))
+    basis = v[:keep].T
+    x = basis @ ((u[:, :keep].T @ b.ravel()) / s[:keep])
+    whitened = b - A @ (v[:rank].T @ ((u[:, :rank].T @ b.ravel()) / s[:rank]))
+    lag = _correlation_time(whitened)
+    scores = np.einsum("kdp,kd->kp", A @ basis, whitened)
+    meat = np.diag(s[:keep] ** 2)
+    if lag:
+        meat = scores.T @ scores
+        for k in range(1, lag + 1):
+            product = scores[k:].T @ scores[:-k]
+            meat += (1 - k / (lag + 1)) * (product + product.T)
+    inside = meat / np.outer(s[:keep] ** 2, s[:keep] ** 2)
+    condition = float(s[0] / s[keep - 1]) if keep else float("inf")
+    return LinearFit(x, basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep], residual, noise, lag,
+                     condition, rank)  # fmt: skip
+
+
+def _correlation_time(residual: Array) -> int:
+    """Return the number of instants after which residuals are uncorrelated; 0 if neighbours are."""
+    centred = residual - residual.mean(axis=0)
+    power = float(np.sum(centred**2))
+    for lag in range(1, max(2, int(MAX_LAG * len(residual)))):
+        if power <= 0 or float(np.sum(centred[lag:] * centred[:-lag])) <= WHITE * power:
+            return 0 if lag == 1 else 2 * lag
+    return int(MAX_LAG * len(residual))

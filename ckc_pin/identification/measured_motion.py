@@ -1,0 +1,318 @@
+"""Configurations, rates and accelerations of the whole tree from measured coordinates.
+
+Each measured coordinate is fitted by a spline of degree five, whose number of knots is chosen by generalized
+cross-validation. The loops then give all coordinates: at each instant the configuration on the constraint manifold
+that is nearest to the splines, weighted by their noise. Rates and accelerations follow in the same sense.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+
+__all__ = ["MeasuredMotion", "SplineFit", "estimate_motion", "fit_spline", "motion_from_states"]
+
+DEGREE = 5
+KNOT_GROWTH = 1.25  # between numbers of knots that are compared
+MIN_SAMPLES_PER_KNOT = 3.0
+EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
+MAX_ITERATIONS, MAX_START_STEPS = 20, 40
+MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
+DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
+OFF_BRANCH = (
+    "identify: the loops do not let the mechanism follow the measured coordinates; they are of another branch or "
+    "another mechanism, or in other units"
+)
+FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredMotion(Immutable):
+    """A motion of a mechanism at m instants.
+
+    Attributes
+    ----------
+    t : (m,) array
+        s.
+    q_tree : (m, nq) array
+    v_tree, a_tree : (m, n) array
+    rho : (m, n, d) array
+    v_std : (n,) array
+        Standard deviation of the rates; zero if they are exact.
+    """
+
+    t: Array
+    q_tree: Array
+    v_tree: Array
+    a_tree: Array
+    rho: Array
+    v_std: Array
+
+    def directions(self) -> Array:
+        """Return the expected signs of the rates, given their uncertainty, shape (m, n)."""
+        from scipy.special import erf
+
+        uncertain = self.v_std > 0
+        width = np.where(uncertain, np.sqrt(2.0) * self.v_std, 1.0)
+        return np.where(uncertain, erf(self.v_tree / width), np.sign(self.v_tree))
+
+
+@dataclass(frozen=True, eq=False)
+class SplineFit(Immutable):
+    """A spline fitted to one measured quantity.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of a measurement, given or estimated.
+    std : (3,) array
+        Standard deviations of the spline, its rate and its acceleration in the interior, root mean squares.
+    interval : float
+        Distance of two knots, s.
+    """
+
+    spline: Any
+    noise: float
+    std: Array
+    interval: float
+
+    def values(self, t: Array) -> Array:
+        """Return value, rate and acceleration, shape (3, len(t))."""
+        return np.array([self.spline(t), self.spline.derivative(1)(t), self.spline.derivative(2)(t)])
+
+
+def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
+    """Fit a spline to measurements y at increasing times t, which may be unequal; NaN marks gaps.
+
+    Raises
+    ------
+    InputError
+        Fewer than twelve measurements.
+    """
+    measured = np.isfinite(y)
+    t, y = t[measured], y[measured]
+    if len(t) < 2 * (DEGREE + 1):
+        raise InputError(f"identify: {len(t)} measurements of one quantity; at least {2 * (DEGREE + 1)} are needed")
+    best: tuple[float, Any, int] | None = None
+    count, worse = 2.0, 0
+    while DEGREE + count <= len(t) / MIN_SAMPLES_PER_KNOT or best is None:
+        spline, size = _least_squares(t, y, int(count))
+        score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
+        worse = 0 if best is None or score < best[0] else worse + 1
+        if not worse:
+            best = score, spline, size
+        if worse > 8:
+            break
+        count = max(count + 1, count * KNOT_GROWTH)
+    assert best is not None
+    _, spline, size = best
+    if noise is None:
+        noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
+    interval = (t[-1] - t[0]) / (size - DEGREE)
+    return SplineFit(spline, noise, noise * _spline_std(spline, t), float(interval))
+
+
+def _least_squares(t: Array, y: Array, intervals: int) -> tuple[Any, int]:
+    """Return the spline whose knot intervals have equally many measurements, and its number of coefficients."""
+    from scipy.interpolate import make_lsq_spline
+
+    inner = np.quantile(t, np.linspace(0, 1, intervals + 1)[1:-1])
+    knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
+    return make_lsq_spline(t, y, knots, k=DEGREE), intervals + DEGREE
+
+
+def _spline_std(spline: Any, t: Array) -> Array:
+    """Return the root mean square over time of the standard deviations for unit noise."""
+    from scipy.interpolate import BSpline
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    knots = spline.t
+    design = BSpline.design_matrix(t, knots, DEGREE)
+    gram = (design.T @ design).tocsc()
+    size = gram.shape[0]
+    band = np.zeros((DEGREE + 1, size))
+    for k in range(DEGREE + 1):
+        band[DEGREE - k, k:] = gram.diagonal(k)
+    factor = cholesky_banded(band)
+    at = np.linspace(t[0], t[-1], 25)[2:-2]
+    unit = BSpline(knots, np.eye(size), DEGREE)
+    rows = [unit(at), unit.derivative(1)(at), unit.derivative(2)(at)]
+    return np.sqrt([np.mean(np.sum(x.T * cho_solve_banded((factor, False), x.T), axis=0)) for x in rows])
+
+
+def motion_from_states(mechanism: Mechanism, t: Array, q_tree: Array, v_tree: Array, a_tree: Array) -> MeasuredMotion:
+    """Return an exact motion, such as that of a simulated run, given in the coordinates of the tree."""
+    rho = np.array([mechanism.kinematics(q).rho for q in q_tree])
+    return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
+
+
+def estimate_motion(
+    mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit], instants: Array
+) -> tuple[MeasuredMotion, dict[str, float]]:
+    """Estimate the motion of all coordinates at instants from the splines of at least d coordinates.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    t : (2,) array
+        First and last measurement, s.
+    fits : mapping of str to SplineFit
+        By coordinate.
+    instants : (m,) array
+        Those closer to an end than a knot interval and a half are left out.
+
+    Returns
+    -------
+    MeasuredMotion
+    dict of str to float
+        By coordinate, the root mean square distance of the motion from its spline.
+
+    Raises
+    ------
+    InputError
+        The coordinates do not determine the configuration, or the loops do not let the mechanism follow them.
+    """
+    tree, names = mechanism.tree, list(fits)
+    at = tree.indices(tuple(names), "identify: data")
+    margin = EDGE * max(fit.interval for fit in fits.values())
+    instants = instants[(instants >= t[0] + margin) & (instants <= t[-1] - margin)]
+    if not len(instants):
+        raise InputError(f"identify: the data last {t[-1] - t[0]:.3g} s, too short for a spline of {', '.join(names)}")
+    noise = np.array(
+        [max(fit.noise * fit.std[0], 1e-12 * tree.step_scale[k]) for k, fit in zip(at, fits.values(), strict=True)]
+    )
+    measured = np.array([fit.values(instants) for fit in fits.values()])  # (coordinates, 3, m)
+    nearest = _Nearest(mechanism, at, noise)
+    measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
+    here, few = (
+        nearest.start(measured[0, 0], names),
+        np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int)),
+    )
+    followed = []
+    for k in few:
+        here = nearest.solve(here, measured[0, k])
+        followed.append(tree.to_coordinates(here.q_tree))
+    guess = np.array([np.interp(instants, instants[few], column) for column in np.array(followed).T]).T
+    q_tree = nearest.solve_many(guess, measured[0])
+    off = np.array([tree.to_coordinates(q) for q in q_tree])[:, at] - measured[0]
+    distance = np.sqrt(np.mean(off**2, axis=0))
+    nearest.require_near(distance, names)
+    rho, v_tree, a_tree = nearest.rates(q_tree, measured[1], measured[2])
+    spread = np.array([fit.noise * fit.std[1] for fit in fits.values()])
+    by_rate = [(r @ np.linalg.pinv(r[at])) * spread for r in rho[:: max(1, len(rho) // 20)]]
+    v_std = np.sqrt(np.mean(np.square(by_rate), axis=0).sum(axis=1))
+    return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std), dict(
+        zip(names, distance.tolist(), strict=True)
+    )
+
+
+class _Nearest:
+    """Finds closed configurations nearest to measured coordinates."""
+
+    def __init__(self, mechanism: Mechanism, at: Any, noise: Array) -> None:
+        self.mechanism, self.at, self.noise = mechanism, at, noise
+        self.rows = mechanism.independent_rows
+        if np.linalg.matrix_rank(mechanism.assembled.rho[at]) < mechanism.d:
+            raise InputError(
+                f"identify: {', '.join(mechanism.coordinates[k] for k in at)} do not determine the configuration; "
+                f"{mechanism.d} coordinates are needed that do, such as {', '.join(mechanism.independent)}"
+            )
+
+    def start(self, measured: Array, names: Sequence[str]) -> Kinematics:
+        """Follow the branch of the assembled configuration along a line to the first measurement."""
+        here = self.mechanism.assembled
+        first = self.mechanism.tree.to_coordinates(here.q_tree)[self.at]
+        steps = 1 + int(np.max(np.abs(measured - first) / self.mechanism.tree.step_scale[self.at]) / 0.1)
+        if steps > 40 * MAX_START_STEPS:
+            largest = names[int(np.argmax(np.abs(measured)))]
+            raise InputError(f"identify: {largest} begins at {np.abs(measured).max():.4g}; are its values in degrees?")
+        for k in range(1, steps + 1):
+            here = self.solve(here, first + (measured - first) * k / steps)
+        return here
+
+    def solve(self, here: Kinematics, measured: Array) -> Kinematics:
+        """Return the nearest closed configuration, by Gauss-Newton on the constraint manifold."""
+        mechanism, tree = self.mechanism, self.mechanism.tree
+        for _ in range(MAX_ITERATIONS):
+            if not np.all(np.isfinite(here.q_tree)) or here.phi_z_factor.singular:
+                break
+            closing = np.zeros(tree.n)
+            closing[here.partition.z] = -here.phi_z_factor.solve(here.phi)
+            missing = (measured - tree.to_coordinates(here.q_tree)[self.at] - closing[self.at]) / self.noise
+            step = closing + here.rho @ np.linalg.lstsq(here.rho[self.at] / self.noise[:, None], missing, rcond=None)[0]
+            here = here.integrate(step)
+            if tree.step_size(step) <= 1e-10 and np.abs(here.phi).max(initial=0.0) <= mechanism.tolerance:
+                return here
+        raise InputError(OFF_BRANCH)
+
+    def solve_many(self, guess: Array, measured: Array) -> Array:
+        """Return the nearest closed configurations (m, nq) to measurements, from guesses (m, n) of all coordinates."""
+        tree = self.mechanism.tree
+        q_tree = np.array([tree.from_coordinates(numbers) for numbers in guess])
+        for _ in range(MAX_ITERATIONS):
+            phi, rho, phi_z = self._terms(q_tree)
+            closing = np.zeros((len(q_tree), tree.n))
+            if phi.shape[1]:
+                closing[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, phi[:, :, None])[:, :, 0]
+            numbers = np.array([tree.to_coordinates(q) for q in q_tree])
+            dq = self._independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
+            step = closing + np.einsum("knd,kd->kn", rho, dq)
+            q_tree = integrate_many(tree, q_tree, step)
+            if np.max(tree.step_size(step)) <= 1e-9:
+                return q_tree
+        raise InputError(OFF_BRANCH)
+
+    def rates(self, q_tree: Array, rates: Array, accelerations: Array) -> tuple[Array, Array, Array]:
+        """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates."""
+        tree = self.mechanism.tree
+        phi, rho, phi_z = self._terms(q_tree)
+        v_tree = np.einsum("knd,kd->kn", rho, self._independent_part(rho, rates))
+        drift = np.zeros((len(q_tree), tree.n))
+        if phi.shape[1]:
+            J_dot_v = np.zeros_like(phi)
+            step = DIFFERENCE_STEP / np.maximum(tree.step_size(v_tree), 1e-6)[:, None]
+            for weight, far in ((8, 1), (-8, -1), (-1, 2), (1, -2)):  # a difference of fourth order
+                _, J = self._closure(integrate_many(tree, q_tree, far * step * v_tree))
+                J_dot_v += weight / (12 * step) * np.einsum("krn,kn->kr", J, v_tree)
+            drift[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, J_dot_v[:, :, None])[:, :, 0]
+        missing = self._independent_part(rho, accelerations - drift[:, self.at])
+        return rho, v_tree, drift + np.einsum("knd,kd->kn", rho, missing)
+
+    def _closure(self, q_tree: Array) -> tuple[Array, Array]:
+        phi, J = evaluate_closure(self.mechanism.tree, self.mechanism.closure, q_tree)
+        return phi[:, self.rows], J[:, self.rows]
+
+    def _terms(self, q_tree: Array) -> tuple[Array, Array, Array]:
+        """Return phi (m, rows), rho (m, n, d) and phi_z (m, rows, rows), without redundant rows."""
+        partition = self.mechanism.partition
+        phi, J = self._closure(q_tree)
+        phi_z = J[:, :, partition.z]
+        rho = np.zeros((len(q_tree), self.mechanism.n, self.mechanism.d))
+        rho[:, partition.q, np.arange(self.mechanism.d)] = 1.0
+        if phi.shape[1]:
+            rho[:, partition.z] = -np.linalg.solve(phi_z, J[:, :, partition.q])
+        return phi, rho, phi_z
+
+    def _independent_part(self, rho: Array, measured: Array) -> Array:
+        """Return the least-squares solution q_dot (m, d) of rho q_dot = measured in the measured coordinates."""
+        rows = rho[:, self.at] / self.noise[:, None]
+        return np.einsum("kdi,ki->kd", np.linalg.pinv(rows), measured / self.noise)
+
+    def require_near(self, off: Array, names: Sequence[str]) -> None:
+        """Refuse measurements that the mechanism cannot follow."""
+        ratio = off / np.maximum(self.noise, 1e-9)
+        worst = int(np.argmax(ratio))
+        if off[worst] > 1e-6 and ratio[worst] > FOLLOW_FACTOR:
+            raise InputError(
+                f"identify: {names[worst]} is {off[worst]:.3g} off the constraint manifold, {ratio[worst]:.0f} times "
+                "its noise; the lengths differ from the mechanism's (calibrate them first), or a reading has an offset"
+            )

@@ -1,0 +1,162 @@
+"""Recorded motions: measured quantities over time, from files, arrays, data frames and runs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.base.validation import suggest_name
+from ckc_pin.errors import InputError
+from ckc_pin.identification.spec import UNITS, DataSpec
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.run.run import Run
+
+__all__ = ["Record", "read_record"]
+
+MAX_BYTES = 2_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Record(Immutable):
+    """Measurements of one motion.
+
+    Attributes
+    ----------
+    source : str
+        Name in messages.
+    t : (m,) array
+        Increasing, s.
+    values : mapping of str to (m,) array
+        By quantity, in SI units; NaN marks gaps.
+    noise : mapping of str to float
+        Standard deviations that are known.
+    delay : mapping of str to float
+        s.
+    validation : bool
+    """
+
+    source: str
+    t: Array
+    values: Mapping[str, Array]
+    noise: Mapping[str, float] = field(default_factory=dict)
+    delay: Mapping[str, float] = field(default_factory=dict)
+    validation: bool = False
+
+    def times(self, quantity: str) -> Array:
+        """Return the times at which the values of a quantity happened, s."""
+        return self.t - self.delay.get(quantity, 0.0)
+
+
+def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, folder: Path | None = None) -> Record:
+    """Return measurements as a record.
+
+    Parameters
+    ----------
+    data : str, Path, Run, mapping of str to arrays, or DataFrame
+        With ``t`` and quantities by name.
+    mechanism : Mechanism
+    spec : DataSpec, optional
+        Noise, names, units and delays.
+    folder : Path, optional
+        That a file is relative to.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, times that do not increase, or quantities that the mechanism does not have.
+    """
+    spec = spec or DataSpec(file="data")
+    if isinstance(data, Run):
+        columns = {"t": data.t, **dict(zip(mechanism.coordinates, data.q_tree.T, strict=True))}
+        columns |= {f"tau.{name}": column for name, column in zip(mechanism.motors.names, data.tau.T, strict=True)}
+        source = data.scene_name
+    elif isinstance(data, str | Path):
+        path = (folder or Path()) / data
+        source, columns = str(data), _read_file(path)
+    else:
+        source = "data"
+        columns = {str(name): np.asarray(data[name], dtype=float) for name in data}
+    columns = {name: columns.pop(column) for name, column in _renamed(columns, spec, source).items()} | columns
+    if "t" not in columns:
+        raise InputError(
+            f"{source}: no column 't'; there are {', '.join(columns)}; names = {{t = \"COLUMN\"}} renames one"
+        )
+    quantities = [*mechanism.coordinates, *(f"v.{name}" for name in mechanism.coordinates)]
+    quantities += [f"tau.{name}" for name in mechanism.motors.names]
+    factors = {name: UNITS[unit] for name, unit in spec.units.items()}
+    t = np.asarray(columns["t"], dtype=float) * factors.get("t", 1.0)
+    _require_increasing(t, source)
+    values = {name: x * factors.get(name, 1.0) for name, x in columns.items() if name in quantities}
+    for what, names in (("noise", spec.noise), ("units", spec.units), ("delay", spec.delay)):
+        missing = next((name for name in names if name not in (*values, "t")), None)
+        if missing is not None:
+            raise InputError(
+                f"{source}: {what}: {missing}: no such quantity{suggest_name(missing, list(values))}; the columns of "
+                f"this mechanism are {', '.join(values)}"
+            )
+    for name, x in values.items():
+        if x.shape != t.shape:
+            raise InputError(
+                f"{source}: {name}: {x.shape} values for {t.shape} times; one value for each time is needed"
+            )
+    inside = np.isfinite(t) if spec.span is None else (t >= spec.span[0]) & (t <= spec.span[1])
+    values = {name: x[inside] for name, x in values.items()}
+    return Record(source, t[inside], values, spec.noise, spec.delay, spec.validation)
+
+
+def _renamed(columns: Mapping[str, Array], spec: DataSpec, source: str) -> dict[str, str]:
+    for name, column in spec.names.items():
+        if column not in columns:
+            raise InputError(
+                f"{source}: names: {name}: no column {column!r}{suggest_name(column, list(columns))}; there are "
+                f"{', '.join(columns)}"
+            )
+    return dict(spec.names)
+
+
+def _read_file(path: Path) -> dict[str, Array]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: larger than {MAX_BYTES / 1e9:.0f} GB; give a part of the recording")
+        if path.suffix == ".parquet":
+            return _read_parquet(path)
+        with path.open(encoding="utf-8", newline="") as file:
+            names = [name.strip() for name in next(csv.reader(file), [])]
+            numbers = np.genfromtxt(file, delimiter=",", dtype=float)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not a table of numbers below a row of names: {str(error).splitlines()[0]}") from None
+    numbers = np.atleast_2d(numbers)
+    if not names or numbers.shape[1] != len(names):
+        raise InputError(
+            f"{path}: {len(names)} names in the first row and {numbers.shape[1]} columns of numbers below it"
+        )
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: a name stands twice in the first row")
+    return dict(zip(names, numbers.T, strict=True))
+
+
+def _read_parquet(path: Path) -> dict[str, Array]:
+    try:
+        import pandas
+
+        frame = pandas.read_parquet(path)
+    except ImportError:
+        raise InputError(f"{path}: reading Parquet needs pandas and pyarrow: pip install pandas pyarrow") from None
+    return {str(name): np.asarray(frame[name], dtype=float) for name in frame.columns}
+
+
+def _require_increasing(t: Array, source: str) -> None:
+    if not np.all(np.isfinite(t)):
+        raise InputError(f"{source}: t: row {int(np.argmin(np.isfinite(t))) + 1} has no time")
+    back = np.flatnonzero(np.diff(t) <= 0)
+    if len(back):
+        k = int(back[0])
+        raise InputError(f"{source}: t does not increase: {t[k]:.9g} is followed by {t[k + 1]:.9g} (row {k + 2})")

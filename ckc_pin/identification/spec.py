@@ -1,0 +1,132 @@
+"""Typed structure of an identification's file, `NAME.identify.toml`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from ckc_pin.base.sources import Sources
+from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
+from ckc_pin.errors import InputError
+
+__all__ = ["UNITS", "DataSpec", "EstimateSpec", "IdentifySpec", "read_identify"]
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "rad": 1.0, "deg": 0.017453292519943295, "m": 1.0, "mm": 1e-3,
+         "N": 1.0, "mN": 1e-3, "N m": 1.0, "mN m": 1e-3, "rad/s": 1.0, "deg/s": 0.017453292519943295, "rpm":
+         0.10471975511965978, "m/s": 1.0, "mm/s": 1e-3}  # fmt: skip
+PositiveFloat = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class DataSpec(_Spec, frozen=True):
+    """One recorded motion.
+
+    Attributes
+    ----------
+    file
+        A CSV or Parquet file in the folder of this one. Its columns are ``t`` and quantities by name: coordinates,
+        ``v.COORDINATE``, and ``tau.MOTOR``. An empty field is a gap.
+        ``file = "swing.csv"``
+    noise : the quantity's
+        Standard deviations of measurements by quantity; estimated for the others.
+        ``noise = {theta_1 = 1e-4, "tau.theta_1" = 0.01}``
+    names
+        Columns by quantity, if the file calls them otherwise.
+        ``names = {t = "stamp", theta_1 = "position_1"}``
+    units
+        Units by quantity, if they are not SI: deg, mm, ms, rpm and others.
+        ``units = {theta_1 = "deg", t = "ms"}``
+    delay : s
+        Delays of quantities: how much later than it happened a value was recorded.
+        ``delay = {"tau.theta_1" = 0.002}``
+    span : s
+        First and last time that are used.
+        ``span = [0.5, 9.5]``
+    validation
+        The motion is not fitted; the fit is compared with it.
+        ``validation = true``
+    """
+
+    file: str
+    noise: dict[str, PositiveFloat] = {}
+    names: dict[str, str] = {}
+    units: dict[str, str] = {}
+    delay: dict[str, float] = {}
+    span: tuple[float, float] | None = None
+    validation: bool = False
+
+
+class EstimateSpec(_Spec, frozen=True):
+    """What is estimated, and how.
+
+    Attributes
+    ----------
+    parameters
+        Names of parameters, with wildcards. ``link.NAME.inertial`` are the ten inertial numbers of a link.
+        ``parameters = ["link.*.inertial", "joint.*.friction"]``
+    method
+        ``"torques"``: eq. 1, which is linear in the parameters.
+        ``method = "torques"``
+    physical
+        Whether inertias have to be those of a body that can exist.
+        ``physical = false``
+    robust
+        Whether instants with large residuals have less weight.
+        ``robust = true``
+    """
+
+    parameters: Annotated[list[str], msgspec.Meta(min_length=1)]
+    method: Literal["torques"] = "torques"
+    physical: bool = True
+    robust: bool = False
+
+
+class IdentifySpec(_Spec, frozen=True):
+    """An identification: a mechanism, recorded motions, and what is estimated from them.
+
+    Attributes
+    ----------
+    mechanism
+        A shipped name, or a path relative to this file.
+        ``mechanism = "five_bar"``
+    parameters : as the parameter's
+        Known values of parameters that differ from the mechanism's files.
+        ``parameters = {"link.link_2.mass" = 0.3}``
+    data
+        Recorded motions.
+    estimate
+        What is estimated.
+    """
+
+    mechanism: str
+    data: Annotated[list[DataSpec], msgspec.Meta(min_length=1)]
+    estimate: EstimateSpec
+    parameters: dict[str, float | list[float]] = {}
+
+
+def read_identify(path: str | Path) -> tuple[IdentifySpec, Sources]:
+    """Read an identification's file.
+
+    Raises
+    ------
+    InputError
+        The file does not exist, is not TOML, or has an unknown key or a wrong value.
+    """
+    path = Path(path)
+    data = read_toml(read_text(path, "identification"), str(path))
+    join_dotted_keys(data, "parameters")
+    sources = Sources(str(path), path.parent)
+    spec = convert(data, IdentifySpec, sources.name)
+    for entry in spec.data:
+        for quantity, unit in entry.units.items():
+            if unit not in UNITS:
+                raise InputError(
+                    f"{sources.name}: data: {entry.file}: units: {quantity}: no unit {unit!r}; there are "
+                    f"{', '.join(UNITS)}"
+                )
+    return spec, sources

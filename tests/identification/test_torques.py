@@ -1,0 +1,272 @@
+"""Parameters from simulated measurements of torques, with and without noise, against those they were simulated with."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import ckc_pin
+from ckc_pin import InputError, Mechanism, identify, inverse_dynamics, load
+from ckc_pin.identification.pseudo_inertia import MOMENTS, pseudo_inertia
+from ckc_pin.identification.regressor import TorqueRegressor, link_moments
+from tests.contract.helpers.command import ckc
+
+FRICTION = {
+    "joint.theta_1.friction": 0.05, "joint.theta_2.friction": 0.02, "joint.theta_3.friction": 0.05,
+    "joint.theta_4.friction": 0.02, "joint.theta_1.damping": 0.02, "joint.theta_2.damping": 0.01,
+    "joint.theta_3.damping": 0.02, "joint.theta_4.damping": 0.01,
+}  # fmt: skip
+DESIRED = {
+    "five_bar": {
+        "theta_1": {"offset": 0.0, "harmonics": [[0.5, 2.5, 0.0], [0.2, 7.5, 1.0], [0.1, 12.5, 2.0]]},
+        "theta_3": {"offset": 0.785, "harmonics": [[0.4, 5.0, 0.5], [0.3, 7.5, -1.0], [0.08, 10.0, 0.3]]},
+    },
+    "delta": {
+        f"arm_{k}": {"offset": 0.3, "harmonics": [[0.3, 3.0 + k, 0.7 * k], [0.1, 9.0 - k, k], [0.05, 14.0, 2.0 * k]]}
+        for k in (1, 2, 3)
+    },
+}
+PARAMETERS = ("link.*.inertial", "joint.*.friction", "joint.*.damping")
+
+
+@cache
+def motion(name, t_end, dt):
+    """Return the exact motion and torques of a mechanism with friction."""
+    true = FRICTION if name == "five_bar" else {}
+    scene = "five_bar/tracking" if name == "five_bar" else ckc_pin.Scene("delta", t_end=1.0, controller={
+        "type": "tracking", "Lambda": 1.0, "K_D": 10.0, "desired": DESIRED["delta"]})  # fmt: skip
+    overrides = {"controller.desired": DESIRED[name], "solver.output_dt": dt, "t_end": t_end, **true}
+    forces = inverse_dynamics(scene, overrides)
+    assert forces.status == "done"
+    return load(name, true or None), forces
+
+
+def record(name, q_noise=0.0, torque_noise=0.0, seed=0, t_end=4.0, dt=0.004):
+    """Return measurements of the independent coordinates and all torques."""
+    mechanism, forces = motion(name, t_end, dt)
+    random = np.random.default_rng(seed)
+    data = {"t": forces.t}
+    for coordinate in mechanism.independent:
+        exact = forces.q_tree[:, mechanism.coordinates.index(coordinate)]
+        data[coordinate] = exact + q_noise * random.normal(size=len(exact))
+    for motor, tau in zip(mechanism.motors.names, forces.tau.T, strict=True):
+        data[f"tau.{motor}"] = tau + torque_noise * random.normal(size=len(tau))
+    return data
+
+
+def errors(result, mechanism, parameters=PARAMETERS):
+    """Return the errors of all base combinations, and their standard deviations."""
+    regressor = TorqueRegressor(mechanism, parameters)
+    truth = dict(zip((x.name for x in regressor.unknowns), regressor.start, strict=True))
+    off = [x.value - sum(c * truth[name] for name, c in x.coefficients.items()) for x in result.base]
+    return np.array(off), np.array([x.std for x in result.base])
+
+
+@pytest.mark.parametrize(("name", "count"), [("five_bar", 19), ("delta", 34)])
+def test_exact_data_give_the_truth(name, count):
+    parameters = PARAMETERS if name == "five_bar" else ("link.*.inertial",)
+    start = load(name, {"link.link_1.mass": 0.2, "link.link_3.mass": 0.3}) if name == "five_bar" else load(name)
+    data = record(name, t_end=1.5, dt=0.001)
+    result = identify(start, data, parameters, physical=False)
+    assert len(result.base) == count
+    off, _ = errors(result, motion(name, 4.0, 0.004)[0] if name == "five_bar" else start, parameters)
+    assert np.abs(off).max() <= 1e-8
+
+
+def test_truth_is_within_two_standard_deviations():
+    inside = total = 0
+    for seed in range(12):
+        result = identify("five_bar", record("five_bar", 1e-4, 0.01, seed), PARAMETERS, physical=False)
+        off, std = errors(result, motion("five_bar", 4.0, 0.004)[0])
+        inside, total = inside + int(np.sum(np.abs(off) <= 2 * std)), total + len(off)
+    assert inside >= binom.ppf(1e-3, total, 0.9)
+
+
+def test_torques_of_another_motion_are_predicted_to_their_noise():
+    data, other = record("five_bar", 1e-5, 0.01), record("five_bar", 1e-5, 0.01, seed=1, t_end=3.0, dt=0.001)
+    result = identify("five_bar", data, PARAMETERS, validation=other, noise={"tau.theta_1": 0.01, "tau.theta_3": 0.01})
+    for residuals in (result.residuals, result.validation):
+        assert set(residuals) == {"tau.theta_1", "tau.theta_3"}
+        for residual in residuals.values():
+            assert residual.expected == 0.01
+            assert residual.rms <= 1.05 * residual.expected
+            assert abs(residual.autocorrelation) <= 0.1
+
+
+def test_noisy_inertias_are_those_of_bodies_and_load_again():
+    for seed in range(4):
+        data = record("five_bar", 1e-3, 0.3, seed)
+        result = identify("five_bar", data, PARAMETERS)
+        assert result.physical
+        rebuilt = load("five_bar", dict(result.values))
+        for link in ("link_1", "link_2", "link_3", "link_4"):
+            moments = link_moments(TorqueRegressor(rebuilt, ["link.*.inertial"]).parameters, link)
+            assert np.linalg.eigvalsh(pseudo_inertia(moments))[0] > 0
+        again = identify(rebuilt, data, PARAMETERS, physical=False)
+        for ours, theirs in zip(result.residuals.values(), again.residuals.values(), strict=True):
+            assert ours.rms <= 1.02 * theirs.rms
+
+
+def test_physical_result_equals_the_unconstrained_one_where_that_is_physical():
+    data = record("five_bar", 1e-5, 1e-4)
+    free, bound = (identify("five_bar", data, PARAMETERS, physical=physical) for physical in (False, True))
+    for a, b in zip(free.base, bound.base, strict=True):
+        assert a.combination == b.combination
+        assert abs(a.value - b.value) <= 0.05 * a.std + 1e-9
+
+
+ROD = """<robot name="rod"><link name="base"/>
+  <link name="rod"><inertial><origin xyz="0.4 0 0"/><mass value="1.5"/>
+    <inertia ixx="0.01" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="weight"><inertial><origin xyz="0.02 0 0.01"/><mass value="0.7"/>
+    <inertia ixx="0.002" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/></joint>
+  <joint name="weld" type="fixed"><parent link="rod"/><child link="weight"/>
+    <origin xyz="0.8 0 0" rpy="0.3 0 0"/></joint>
+</robot>"""
+MASS, MOMENT, FRICTION_OF_ROD, DAMPING = 2.2, 1.5 * 0.4 + 0.7 * 0.82, 0.3, 0.2
+
+
+def rod_data(noise=0.0):
+    """Return a motion of the rod, and its torques by hand."""
+    t = np.linspace(0, 5, 1001)
+    q = 0.8 * np.sin(2 * t) + 0.4 * np.sin(5 * t + 1)
+    v = 1.6 * np.cos(2 * t) + 2 * np.cos(5 * t + 1)
+    a = -3.2 * np.sin(2 * t) - 10 * np.sin(5 * t + 1)
+    tilted = np.sin(0.3) * 0.0  # the weight's inertia is isotropic, its centre turns with the weld
+    height = 0.01 * np.cos(0.3) + tilted
+    about = 0.03 + 1.5 * 0.4**2 + 0.002 + 0.7 * (0.82**2 + height**2)
+    moment_z = 0.7 * height
+    gravity = -9.81 * (MOMENT * np.cos(q) + moment_z * np.sin(q))  # potential energy falls where the rod turns down
+    tau = about * a + gravity + DAMPING * v + FRICTION_OF_ROD * np.sign(v)
+    tau = tau + noise * np.random.default_rng(0).normal(size=len(t))
+    return {"t": t, "hinge": q, "tau.hinge": tau}, about, moment_z
+
+
+def test_tree_equals_least_squares_by_hand_and_welded_links_are_combined():
+    start = Mechanism.from_urdf(ROD)
+    data, about, moment_z = rod_data()
+    result = identify(start, data, ["link.*.inertial", "joint.hinge.friction", "joint.hinge.damping"])
+    assert len(result.base) == 5
+    assert result.parameters["joint.hinge.friction"].value == pytest.approx(FRICTION_OF_ROD, abs=2e-3)
+    assert result.parameters["joint.hinge.damping"].value == pytest.approx(DAMPING, abs=2e-3)
+    for link in ("rod", "weight"):
+        assert result.parameters[f"link.{link}.mass"].value is None
+    verdicts = {name: x.verdict for name, x in result.parameters.items()}
+    assert verdicts["link.rod.mass"] == "not identifiable"
+    assert verdicts["link.weight.com.x"] == "only in a combination"
+    assert verdicts["link.rod.inertia.ixx"] == "not identifiable"
+    values = {name: x for name, x in result.values.items() if name.startswith("link.")}
+    rebuilt = Mechanism.from_urdf(ROD, parameters=values)
+    body = rebuilt.tree.model.inertias[1]
+    assert body.mass * body.lever[0] == pytest.approx(MOMENT, abs=1e-3)
+    assert body.mass * body.lever[2] == pytest.approx(moment_z, abs=1e-3)
+    assert body.toDynamicParameters()[6] == pytest.approx(about, abs=1e-3)
+
+
+def test_offsets_gaps_units_and_delays():
+    data, *_ = rod_data()
+    data["tau.hinge"] = data["tau.hinge"] + 0.25
+    data["hinge"] = np.rad2deg(data["hinge"])
+    data["hinge"][100:110] = np.nan
+    data["tau.hinge"][400:500] = np.nan
+    from ckc_pin.identification.records import read_record
+    from ckc_pin.identification.spec import DataSpec
+
+    mechanism = Mechanism.from_urdf(ROD)
+    spec = DataSpec(file="rod", units={"hinge": "deg"}, delay={"tau.hinge": 0.0})
+    read = read_record(data, mechanism, spec)
+    result = identify(
+        mechanism, {"t": read.t, **read.values}, ["joint.hinge.friction", "joint.hinge.damping", "motor.*.offset"]
+    )
+    assert result.parameters["motor.hinge.offset"].value == pytest.approx(0.25, abs=2e-3)
+    assert result.instants < 905
+
+
+def test_number_of_base_parameters_equals_the_rank_of_an_independent_regressor():
+    """Pinocchio's regressor, projected on a null space of differences of the closure."""
+    import pinocchio as pin
+
+    mechanism, forces = motion("five_bar", 4.0, 0.004)
+    tree, random = mechanism.tree, np.random.default_rng(0)
+    rows = []
+    for q in forces.q_tree[::40]:
+        q_tree = tree.from_coordinates(q)
+        J = np.array([(mechanism.closure.phi(mechanism.kinematics(q_tree + h).pose)
+                       - mechanism.closure.phi(mechanism.kinematics(q_tree - h).pose)) / 2e-6
+                      for h in 1e-6 * np.eye(4)]).T  # fmt: skip
+        null = np.linalg.svd(J)[2][2:].T
+        v = null @ random.normal(size=2)
+        later, before = (mechanism.kinematics(q_tree + s * 1e-5 * v) for s in (1, -1))
+        a = null @ random.normal(size=2) - np.linalg.pinv(J) @ ((later.J - before.J) @ v / 2e-5)
+        rows.append(null.T @ pin.computeJointTorqueRegressor(tree.model, tree.data, q_tree, v, a))
+    rank = np.linalg.matrix_rank(np.vstack(rows), tol=1e-7)
+    result = identify("five_bar", record("five_bar"), ["link.*.inertial"], physical=False)
+    assert len(result.base) == rank
+
+
+BAD = [
+    ({"theta_1": [0.0]}, "no column 't'"),
+    ({"t": [0.0, 1.0, 1.0], "theta_1": [0, 0, 0]}, "t does not increase: 1 is followed by 1"),
+    ({"t": [0.0, 1.0], "theta_1": [0, 0], "tau.theta_1": [0, 0], "tau.theta_3": [0, 0]}, "no column theta_1, theta_3"),
+    ({"t": [0.0, 1.0], "theta_1": [0, 0], "theta_3": [0, 0], "tau.theta_1": [0, 0]}, "no column tau.theta_3"),
+    ({"t": [0.0, 1.0], "theta_1": [0, 90.0], "theta_3": [0, 0], "tau.theta_1": [0, 0], "tau.theta_3": [0, 0]},
+     "theta_1 reaches 90 rad; if these are degrees"),
+    ({"t": [0.0, 1.0], "theta_1": [0, 0], "theta_3": [0, 0], "tau.theta_1": [0, 0], "tau.theta_3": [0, 0]},
+     "2 measurements of one quantity; at least 12"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("data", "message"), BAD)
+def test_bad_data_have_one_message(data, message):
+    with pytest.raises(InputError, match=message.replace(".", r"\.")):
+        identify("five_bar", {name: np.array(x, dtype=float) for name, x in data.items()}, ["link.*.inertial"])
+
+
+def test_bad_parameters_and_short_or_saturated_data_have_one_message():
+    with pytest.raises(InputError, match=r"nothing is called 'link.\*.size'.*link.\*.inertial"):
+        identify("five_bar", record("five_bar"), ["link.*.size"])
+    few = {name: x[:20] for name, x in record("five_bar").items()}
+    with pytest.raises(InputError, match=r"unknowns; record a longer motion|too short"):
+        identify("five_bar", few, PARAMETERS)
+    off = record("five_bar")
+    off["theta_1"] = off["theta_1"] + 3.0
+    with pytest.raises(InputError, match="another branch or another mechanism"):
+        identify("five_bar", off, PARAMETERS)
+    limited = Mechanism.from_urdf(ROD, motors=[{"name": "hinge", "joint": "hinge", "torque_limit": 1.0}])
+    data, *_ = rod_data()
+    data["tau.hinge"] = np.clip(data["tau.hinge"], -1, 1)
+    with pytest.raises(InputError, match="at its torque limit most of the time"):
+        identify(limited, data, ["joint.hinge.friction"])
+
+
+def test_command_writes_result_parameters_and_figures(tmp_path):
+    data = record("five_bar", 1e-4, 0.01)
+    for name, seed in (("swing.csv", 0), ("other.csv", 1)):
+        columns = record("five_bar", 1e-4, 0.01, seed) if seed else data
+        rows = np.array(list(columns.values())).T
+        np.savetxt(tmp_path / name, rows, delimiter=",", header=",".join(columns), comments="")
+    file = tmp_path / "arm.identify.toml"
+    file.write_text(
+        'mechanism = "five_bar"\n[[data]]\nfile = "swing.csv"\nnoise = {"tau.theta_1" = 0.01}\n'
+        '[[data]]\nfile = "other.csv"\nvalidation = true\n'
+        '[estimate]\nparameters = ["link.*.inertial", "joint.*.friction", "joint.*.damping"]\n'
+    )
+    done = ckc("identify", str(file), "--out", str(tmp_path / "o"), "--figures", "--json")
+    assert done.code == 0
+    assert json.loads((tmp_path / "o" / "identification.json").read_text()) == done.json
+    assert set(done.json["validation"]) == {"tau.theta_1", "tau.theta_3"}
+    assert done.json["parameters"]["link.link_1.mass"] == {
+        "value": None, "std": None, "start": 0.2451, "verdict": "not identifiable"}  # fmt: skip
+    assert done.json["parameters"]["joint.theta_1.friction"]["value"] == pytest.approx(0.05, abs=0.02)
+    for figure in ("torques", "residuals", "correlation"):
+        assert (tmp_path / "o" / f"{figure}.png").stat().st_size > 5000
+    import tomllib
+
+    values = tomllib.loads((tmp_path / "o" / "parameters.toml").read_text())["parameters"]
+    assert load("five_bar", values).d == 2
+    assert len(MOMENTS) * 4 + 8 == len(values)
