@@ -16,7 +16,7 @@ from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import LinearFit, fit_linear
-from ckc_pin.identification.measured_motion import MeasuredMotion, estimate_motion, fit_spline
+from ckc_pin.identification.measured_motion import MeasuredMotion, SplineFit, estimate_motion, fit_spline
 from ckc_pin.identification.physical import nearest_physical
 from ckc_pin.identification.pseudo_inertia import MOMENTS, pseudo_inertia
 from ckc_pin.identification.records import Record, read_record
@@ -307,6 +307,8 @@ class _Equations:
     to_motors : (m, motors, d) array
         Torques that give generalized forces, least-squares.
     tau : (m, motors) array
+    fits : mapping of str to SplineFit
+        By measured coordinate.
     """
 
     record: Record
@@ -315,6 +317,7 @@ class _Equations:
     right: Array
     to_motors: Array
     tau: Array
+    fits: Mapping[str, SplineFit]
 
 
 def _identify(
@@ -334,6 +337,10 @@ def _identify(
                 "less"
             )
         fit = fit_linear(columns, right, robust=robust)
+        parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
+        fit = fit.with_errors(
+            [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
+        )
         step = fit.x
         if physical:
             step = _physical_step(regressor, fit)
@@ -372,7 +379,21 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     columns, force = regressor.rows(motion)
     to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
     right = np.einsum("kdm,km->kd", to_forces, tau) - force
-    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau)
+    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau, fits)
+
+
+def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
+    """Return the steps of the solution (r, any) that errors of the accelerations cause, of unit variance each.
+
+    They are correlated over a knot interval and too small beside the noise of torques to show in the residuals. The
+    inertia that turns them into torques is that of the start values.
+    """
+    motion = equations.motion
+    at = mechanism.tree.indices(tuple(equations.fits), "identify")
+    D_tree = np.array([mechanism.tree.mass_matrix(q) for q in motion.q_tree])
+    by_coordinate = D_tree @ motion.rho @ np.linalg.pinv(motion.rho[:, at])
+    steps = influence @ (motion.rho.swapaxes(1, 2) @ by_coordinate)  # (m, r, coordinates)
+    return [fit.acceleration_errors(motion.t, steps[:, :, k]) for k, fit in enumerate(equations.fits.values())]
 
 
 def _require_radians(mechanism: Mechanism, record: Record, names: Sequence[str]) -> None:
