@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["Combination", "Estimate", "Identification", "Prediction", "Residual", "identify", "identify_file"]
 
 MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
+MAX_DELAY, DELAY_GRID, MAX_DELAY_INSTANTS = 0.05, 21, 1000  # s; delays that are tried, with so many instants
 IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE = "identified", "only in a combination", "not identifiable"
 LEAK_TOLERANCE = 1e-6  # part of a gradient in directions that are not determined
 SATURATED = 0.999  # of a torque limit
@@ -326,6 +327,7 @@ def _identify(
     regressor = TorqueRegressor(mechanism, parameters)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
+        records = [_with_delay(mechanism, regressor, record, warnings) for record in records]
         equations = [_equations(mechanism, regressor, record, warnings) for record in records]
         fitted = [x for x in equations if not x.record.validation]
         if not fitted:
@@ -347,7 +349,9 @@ def _identify(
     return _result(mechanism, regressor, equations, fit, step, physical, warnings)
 
 
-def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> _Equations:
+def _equations(
+    mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str], most: int = MAX_INSTANTS
+) -> _Equations:
     """Estimate the motion of a record, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
@@ -372,7 +376,7 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     if saturated.any():
         warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
     at = np.flatnonzero(used & ~saturated)
-    at = at[:: max(1, -(-len(at) // MAX_INSTANTS))]
+    at = at[:: max(1, -(-len(at) // most))]
     first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
     motion, _ = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
@@ -380,6 +384,30 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
     right = np.einsum("kdm,km->kd", to_forces, tau) - force
     return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau, fits)
+
+
+def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> Record:
+    """Return the record with the delay of its torques that leaves the smallest residual, if it is to be estimated."""
+    from scipy.optimize import minimize_scalar
+
+    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
+    if not any(isinstance(record.delay.get(name), str) for name in torques):
+        return record
+
+    def delayed(delay: float) -> Record:
+        return replace(record, delay={**record.delay, **dict.fromkeys(torques, delay)})
+
+    def residual(delay: float) -> float:
+        equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS)
+        off = fit_linear(equations.columns, equations.right).residual
+        return float(np.log(np.mean(off**2, axis=0) + 1e-300).sum())
+
+    grid = np.linspace(-MAX_DELAY, MAX_DELAY, DELAY_GRID)
+    best = grid[int(np.argmin([residual(delay) for delay in grid]))]
+    step = grid[1] - grid[0]
+    found = minimize_scalar(residual, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-6})
+    warnings.append(f"{record.source}: the torques are {1e3 * found.x:.4g} ms late, estimated from their residuals")
+    return delayed(float(found.x))
 
 
 def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
