@@ -350,7 +350,11 @@ def _identify(
 
 
 def _equations(
-    mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str], most: int = MAX_INSTANTS
+    mechanism: Mechanism,
+    regressor: TorqueRegressor,
+    record: Record,
+    warnings: list[str],
+    max_instants: int = MAX_INSTANTS,
 ) -> _Equations:
     """Estimate the motion of a record, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
@@ -376,7 +380,7 @@ def _equations(
     if saturated.any():
         warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
     at = np.flatnonzero(used & ~saturated)
-    at = at[:: max(1, -(-len(at) // most))]
+    at = at[:: max(1, -(-len(at) // max_instants))]
     first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
     motion, _ = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
@@ -405,9 +409,9 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
     grid = np.linspace(-MAX_DELAY, MAX_DELAY, DELAY_GRID)
     best = grid[int(np.argmin([residual(delay) for delay in grid]))]
     step = grid[1] - grid[0]
-    found = minimize_scalar(residual, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-6})
-    warnings.append(f"{record.source}: the torques are {1e3 * found.x:.4g} ms late, estimated from their residuals")
-    return delayed(float(found.x))
+    minimum = minimize_scalar(residual, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-6})
+    warnings.append(f"{record.source}: the torques are {1e3 * minimum.x:.4g} ms late, estimated from their residuals")
+    return delayed(float(minimum.x))
 
 
 def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
