@@ -1,0 +1,419 @@
+"""Fit of parameters to readings of many poses on the constraint manifold: the implicit loop method.
+
+Each pose has a configuration q' of its own with phi(q', p) = 0. Steps of q' are eliminated pose by pose: those that the
+parameters force on it by the loops, and those along the null space of J by a projection. What remains is a linear
+least-squares problem in the parameters alone, so the cost is linear in the number of poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
+from ckc_pin.errors import InputError
+from ckc_pin.identification.calibration_geometry import Geometry
+from ckc_pin.mechanism.batch import integrate_many
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.rank import jacobian_scales
+from ckc_pin.mechanism.rows import skew
+from ckc_pin.mechanism.units import parameter_unit
+
+__all__ = ["RANK_TOLERANCE", "Fit", "Linearization", "Readings"]
+
+RANK_TOLERANCE = 1e-8  # of the largest singular value of the scaled Jacobian; derivatives are exact
+REDUNDANT_TOLERANCE = 1e-6  # part of a parameter's derivative of phi that no motion can compensate, relative
+MAX_ITERATIONS = 60  # of the Gauss-Newton method
+MAX_HALVINGS = 12
+MAX_STEP = 0.3  # rad, or mechanism sizes
+STEP_TOLERANCE = 1e-13  # rad, or mechanism sizes: a shorter step ends the fit
+DECREASE_TOLERANCE = 1e-10  # relative: a step that decreases the cost by less is the last one
+STALL_TOLERANCE = 1e-7  # rad, or mechanism sizes: a longer step without a decrease is no convergence
+MAX_CLOSING_STEPS = 10
+HOMOTOPY_STEPS = 12  # from the assembled configuration to a pose
+POSE_STEPS = 30  # Gauss-Newton steps of a pose with fixed parameters
+MAX_NOISE_ESTIMATES = 15
+NOISE_TOLERANCE = 1e-3  # relative
+MIN_SIGMA = 1e-12  # rad, or mechanism sizes: smaller residuals are rounding errors
+MIN_REDUNDANCY = 0.1  # of readings whose residuals tell of noise one by one
+MEDIAN_OF_NORMAL = 0.6744897501960817  # of |x| of a standard normal x
+HUBER = 1.345  # standard deviations: 95 % efficiency without outliers
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of coordinates and of components of points, a row for each pose; NaN where one is missing.
+
+    Attributes
+    ----------
+    names : tuple of str
+    values : (poses, readings) array
+    coordinate : (readings,) int array
+        Coordinate that an encoder reads; -1 for a point.
+    component : (readings,) int array
+        3 k + axis of the k-th point; -1 for an encoder.
+    in_metres : (readings,) bool array
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    coordinate: IntArray
+    component: IntArray
+    in_metres: BoolArray
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Readings near an estimate: z - h = free x + fixed dp, with x along the null space of J of each pose.
+
+    Attributes
+    ----------
+    residual : (poses, readings) array
+        z - h, 0 where a reading is missing.
+    free, by_parameter : (poses, readings, d) and (poses, readings, p) arrays
+    null_space, forced : (poses, n, d) and (poses, n, p) arrays
+        Motions of the mechanism, and those that keep the loops closed when parameters change.
+    """
+
+    residual: Array
+    free: Array
+    by_parameter: Array
+    null_space: Array
+    forced: Array
+
+    def reduce(self, weights: Array) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
+        """Eliminate the motions of the poses from the weighted equations.
+
+        Returns
+        -------
+        residual : (equations,) array
+        matrix : (equations, p) array
+        leverage : (poses, readings) array
+            Part of each reading that the motions of its pose fit.
+        recover : function of dp (p,)
+            The steps of all poses (poses, n).
+        """
+        u, s, vt = np.linalg.svd(weights[..., None] * self.free, full_matrices=False)
+        keep = s > 1e-9 * s.max(axis=1, keepdims=True, initial=1e-300)
+        u = u * keep[:, None, :]
+        r, b = (weights * self.residual)[..., None], weights[..., None] * self.by_parameter
+
+        def recover(dp: Array) -> Array:
+            x = np.swapaxes(u, 1, 2) @ (r - (b @ dp)[..., None]) / np.where(keep, s, 1.0)[..., None]
+            return np.asarray((self.null_space @ (np.swapaxes(vt, 1, 2) @ x))[..., 0] + self.forced @ dp)
+
+        rest_r, rest_b = (x - u @ (np.swapaxes(u, 1, 2) @ x) for x in (r, b))
+        return rest_r.ravel(), rest_b.reshape(-1, b.shape[2]), np.sum(u * u, axis=2), recover
+
+
+class Fit:
+    """The state of a fit: values of all parameters, and the configuration of each pose.
+
+    Parameters are those of the geometry, then the offsets of encoders, then the six of the tracker's frame.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    geometry : Geometry
+    readings : Readings
+    offsets : int array
+        Coordinates whose encoders have unknown offsets.
+    tracker : bool
+        Whether the placement of the tracker's frame in the world is unknown.
+    prior : (p,) array
+        Standard deviations of the start values; infinite for those without a prior.
+    huber : bool
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        geometry: Geometry,
+        readings: Readings,
+        offsets: IntArray,
+        tracker: bool,
+        prior: Array,
+        huber: bool,
+    ) -> None:
+        self.mechanism, self.geometry, self.readings, self.offsets = mechanism, geometry, readings, offsets
+        self.tracker, self.prior, self.huber = tracker, prior, huber
+        size = mechanism.size
+        units = {"m": size, "m/rad": size, "rad/m": 1 / size}
+        of_geometry = [units.get(parameter_unit(mechanism, name), 1.0) for name in geometry.names]
+        of_tracker = [size] * 3 + [1.0] * 3 if tracker else []
+        # Steps of parameters are compared in radians and in units of the mechanism's size.
+        self.scale = np.array([*of_geometry, *geometry.tree.step_scale[offsets], *of_tracker])
+        self.is_encoder = readings.coordinate >= 0
+        self.present = np.isfinite(readings.values)
+        self.start = np.concatenate([geometry.values, np.zeros(len(offsets) + 6 * tracker)])
+        self.values = self.start.copy()
+        self.unit = np.where(readings.in_metres, mechanism.size, 1.0)  # of each reading
+        self.sigma = self.unit.copy()
+        self.q_tree = np.tile(mechanism.q_tree, (len(readings.values), 1))
+
+    # --- readings --------------------------------------------------------------------------------
+
+    def predict(self, values: Array, q_tree: Array) -> Array:
+        """Return the readings (poses, readings) without errors."""
+        return self._read(values, q_tree, self.geometry.points(q_tree)[0])
+
+    def _read(self, values: Array, q_tree: Array, points: Array) -> Array:
+        tree, coordinate = self.geometry.tree, self.readings.coordinate
+        h = np.empty((len(q_tree), len(coordinate)))
+        h[:, self.is_encoder] = q_tree[:, tree.q_index[coordinate[self.is_encoder]]] + self._offset(values)
+        if self.tracker:
+            points = (points - values[-6:-3]) @ pin.exp3(values[-3:])
+        h[:, ~self.is_encoder] = points.reshape(len(q_tree), -1)[:, self.readings.component[~self.is_encoder]]
+        return h
+
+    def _offset(self, values: Array) -> Array:
+        by_coordinate, first = np.zeros(self.geometry.tree.n), len(self.geometry.names)
+        by_coordinate[self.offsets] = values[first : first + len(self.offsets)]
+        return by_coordinate[self.readings.coordinate[self.is_encoder]]
+
+    def linearize(self, values: Array, q_tree: Array, target: Array | None = None) -> Linearization:
+        """Return the linearization at closed configurations. The geometry must have these values."""
+        tree, g, (count, n) = self.geometry.tree, len(self.geometry.names), (len(q_tree), self.geometry.tree.n)
+        points, by_q = self.geometry.points(q_tree)
+        phi_p, points_p = self.geometry.parameter_derivatives(q_tree)
+        by_p = np.zeros((*points.shape, len(values)))
+        by_p[..., :g] = points_p
+        if self.tracker:
+            rotation = pin.exp3(values[-3:])
+            seen = ((points - values[-6:-3]) @ rotation).reshape(-1, 3)
+            by_q, by_p = rotation.T @ by_q, rotation.T @ by_p
+            by_p[..., -6:-3] = -rotation.T
+            by_p[..., -3:] = (skew(seen) @ pin.Jexp3(values[-3:])).reshape(*points.shape, 3)
+        c = len(self.is_encoder)
+        h_q, h_p = np.zeros((count, c, n)), np.zeros((count, c, len(values)))
+        encoders, components = np.flatnonzero(self.is_encoder), self.readings.component[~self.is_encoder]
+        read = self.readings.coordinate[encoders]
+        h_q[:, encoders, read] = 1.0
+        h_p[:, encoders, g : g + len(self.offsets)] = read[:, None] == self.offsets
+        h_q[:, ~self.is_encoder] = by_q.reshape(count, -1, n)[:, components]
+        h_p[:, ~self.is_encoder] = by_p.reshape(count, -1, len(values))[:, components]
+        inverse, null_space, open_rows = self._split(self.geometry.evaluate(q_tree)[1])
+        forced = np.zeros((count, n, len(values)))
+        forced[..., :g] = -inverse @ phi_p
+        self._require_closable(phi_p, open_rows)
+        z = self.readings.values if target is None else target
+        residual = np.where(np.isfinite(z), z - self._read(values, q_tree, points), 0.0)
+        return Linearization(residual, h_q @ null_space, h_p + h_q @ forced, null_space, forced)
+
+    def _split(self, jacobian: Array) -> tuple[Array, Array, Array]:
+        """Return the pseudoinverses of J (poses, n, rows), null spaces (poses, n, d), and what redundant rows add."""
+        rows, columns = jacobian_scales(self.geometry.tree, self.geometry.closure)
+        rank = self.mechanism.rank
+        u, s, vt = np.linalg.svd(rows[:, None] * jacobian * columns, full_matrices=True)
+        s = np.maximum(s[:, :rank], 1e-9 * s[:, :1])
+        v = columns[:, None] * np.swapaxes(vt, 1, 2)
+        inverse = (v[:, :, :rank] / s[:, None, :]) @ np.swapaxes(u[:, :, :rank], 1, 2) * rows
+        return inverse, v[:, :, rank:], np.swapaxes(u[:, :, rank:], 1, 2) * rows
+
+    def _require_closable(self, phi_p: Array, open_rows: Array) -> None:
+        """Refuse parameters that redundant rows fix (InputError)."""
+        opened = np.abs(open_rows @ phi_p).max(axis=(0, 1), initial=0.0)
+        limit = REDUNDANT_TOLERANCE * max(1.0, 1.0 / self.geometry.tree.size)
+        if opened.max(initial=0.0) > limit:
+            names = [name for name, x in zip(self.geometry.names, opened, strict=True) if x > limit]
+            rows = ", ".join(self.mechanism.redundant)
+            raise InputError(
+                f"calibrate: parameters: {', '.join(names[:4])}{' and others' * (len(names) > 4)}: the loops do not "
+                f"close with other values, because rows of theirs are redundant ({rows}); leave these parameters out, "
+                "or use loop types without redundant rows, as point_2d"
+            )
+
+    # --- configurations --------------------------------------------------------------------------
+
+    def close(self, q_tree: Array) -> tuple[Array, BoolArray]:
+        """Project configurations onto phi = 0 by minimum-norm steps. Return them, and which of them are closed."""
+        tree, tolerance = self.geometry.tree, max(self.mechanism.tolerance, 1e-11 * self.mechanism.size)
+        phi, jacobian = self.geometry.evaluate(q_tree)
+        size = np.abs(phi).max(axis=1, initial=0.0)
+        for _ in range(MAX_CLOSING_STEPS):
+            step = -(self._split(jacobian)[0] @ phi[..., None])[..., 0]
+            long = tree.step_size(step)
+            step *= np.minimum(1.0, MAX_STEP / np.maximum(long, MAX_STEP))[:, None]
+            trial = integrate_many(tree, q_tree, step)
+            phi_trial, jacobian_trial = self.geometry.evaluate(trial)
+            trial_size = np.abs(phi_trial).max(axis=1, initial=0.0)
+            better = trial_size < size
+            if not better.any():
+                break
+            q_tree, phi = np.where(better[:, None], trial, q_tree), np.where(better[:, None], phi_trial, phi)
+            jacobian = np.where(better[:, None, None], jacobian_trial, jacobian)
+            size = np.where(better, trial_size, size)
+            if size.max() <= 1e-15 * self.mechanism.size:
+                break
+        return q_tree, size <= tolerance
+
+    def place_poses(self) -> None:
+        """Find the configuration of each pose with the start values, on the branch of the assembled configuration."""
+        readings, tree = self.readings, self.geometry.tree
+        weights = self.present / self.unit
+        if self.tracker:
+            weights = weights * self.is_encoder
+        read = readings.coordinate[self.is_encoder]
+        guess = np.tile(self.mechanism.q_tree, (len(readings.values), 1))
+        if len(set(read.tolist())) == tree.n and self.present[:, self.is_encoder].all():
+            guess[:, tree.q_index[read]] = readings.values[:, self.is_encoder] - self._offset(self.values)
+            self.q_tree = self._fit_poses(self.close(guess)[0], readings.values, weights)
+        else:
+            start = self.predict(self.values, guess)
+            for part in np.linspace(0.0, 1.0, HOMOTOPY_STEPS + 1)[1:]:
+                guess = self._fit_poses(guess, start + part * (readings.values - start), weights, 2)
+            self.q_tree = self._fit_poses(guess, readings.values, weights)
+            self._retry_from_neighbours(weights)
+        if self.tracker:
+            self._place_tracker()
+            self.q_tree = self._fit_poses(self.q_tree, readings.values, self.present / self.unit)
+
+    def misses(self, weights: Array | None = None) -> Array:
+        """Return the distance of each pose from its readings, rms in rad or mechanism sizes."""
+        weights = self.present / self.unit if weights is None else weights
+        residual = np.where(self.present, self.readings.values - self.predict(self.values, self.q_tree), 0.0)
+        count = np.maximum(np.count_nonzero(weights, axis=1), 1)
+        return np.asarray(np.linalg.norm(weights * residual, axis=1) / np.sqrt(count))
+
+    def _fit_poses(self, q_tree: Array, target: Array, weights: Array, steps: int = POSE_STEPS) -> Array:
+        for _ in range(steps):
+            step = self.linearize(self.values, q_tree, target).reduce(weights)[3](np.zeros(len(self.values)))
+            size = self.geometry.tree.step_size(step)
+            step *= np.minimum(1.0, MAX_STEP / np.maximum(size, MAX_STEP))[:, None]
+            trial, closed = self.close(integrate_many(self.geometry.tree, q_tree, step))
+            q_tree = np.where(closed[:, None], trial, q_tree)
+            if np.where(closed, size, 0.0).max(initial=0.0) < 1e-8:
+                break
+        return q_tree
+
+    def _retry_from_neighbours(self, weights: Array) -> None:
+        """Start poses that miss their readings again from the nearest pose that meets them."""
+        for _ in range(3):
+            misses = self.misses(weights)
+            bad = misses > 5 * np.median(misses) + 1e-6
+            if not bad.any() or bad.all():
+                return
+            values = np.nan_to_num(self.readings.values) * weights
+            distance = np.linalg.norm(values[:, None] - values[None, ~bad], axis=2)
+            start, before = np.flatnonzero(~bad)[distance.argmin(axis=1)], self.q_tree
+            trial = self._fit_poses(np.where(bad[:, None], before[start], before), self.readings.values, weights)
+            self.q_tree = trial
+            self.q_tree = np.where((self.misses(weights) < misses)[:, None], trial, before)
+
+    def _place_tracker(self) -> None:
+        """Set the tracker's frame to the one that fits the points best (Kabsch)."""
+        at = self.readings.component
+        full = [k for k in range(len(self.mechanism.points)) if all(3 * k + axis in at for axis in range(3))]
+        columns = [[at.tolist().index(3 * k + axis) for axis in range(3)] for k in full]
+        seen = self.readings.values[:, columns].reshape(-1, 3)
+        world = self.geometry.points(self.q_tree)[0][:, full].reshape(-1, 3)
+        valid = np.isfinite(seen).all(axis=1)
+        if np.count_nonzero(valid) < 3:
+            raise InputError(
+                'calibrate: tracker = "unknown" needs x, y and z of a point in at least 3 poses, to place its frame'
+            )
+        seen, world = seen[valid], world[valid]
+        u, _, vt = np.linalg.svd((world - world.mean(axis=0)).T @ (seen - seen.mean(axis=0)))
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        self.values[-3:] = pin.log3(rotation)
+        self.values[-6:-3] = world.mean(axis=0) - rotation @ seen.mean(axis=0)
+        self.start[-6:] = self.values[-6:]
+
+    # --- Gauss-Newton ----------------------------------------------------------------------------
+
+    def weights(self, residual: Array) -> Array:
+        """Return the square roots of the weights of the readings; 0 where one is missing."""
+        size = np.abs(residual) / self.sigma
+        factor = np.sqrt(np.minimum(1.0, HUBER / np.maximum(size, 1e-300))) if self.huber else 1.0
+        return np.asarray(self.present * factor / self.sigma)
+
+    def cost(self, values: Array, residual: Array) -> float:
+        """Return half the sum of squares, or Huber's loss, with the prior's."""
+        size = np.abs(residual) / self.sigma
+        loss = np.where(size > HUBER, HUBER * (size - HUBER / 2), size**2 / 2) if self.huber else size**2 / 2
+        return float(loss.sum() + np.sum(((values - self.start) / self.prior) ** 2) / 2)
+
+    def equations(self, linear: Linearization, weights: Array) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
+        """Return `Linearization.reduce` with an equation for each prior."""
+        residual, matrix, leverage, recover = linear.reduce(weights)
+        known = np.flatnonzero(np.isfinite(self.prior))
+        rows = np.eye(len(self.prior))[known] / self.prior[known, None]
+        offset = (self.start - self.values)[known] / self.prior[known]
+        return np.concatenate([residual, offset]), np.vstack([matrix, rows]), leverage, recover
+
+    def run(self) -> tuple[bool, int]:
+        """Fit all parameters and poses from the present state. Return whether that converged, and the iterations."""
+        scale, tree = self.scale, self.geometry.tree
+        linear = self.linearize(self.values, self.q_tree)
+        cost = self.cost(self.values, linear.residual)
+        for iteration in range(1, MAX_ITERATIONS + 1):
+            residual, matrix, _, recover = self.equations(linear, self.weights(linear.residual))
+            u, s, vt = np.linalg.svd(matrix * scale, full_matrices=False)
+            rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
+            reduced = u[:, :rank].T @ residual
+            dp = scale * (vt[:rank].T @ (reduced / s[:rank]))
+            dq = recover(dp)
+            longest = max(float(np.abs(dp / scale).max(initial=0.0)), float(tree.step_size(dq).max(initial=0.0)))
+            if longest < STEP_TOLERANCE or cost == 0.0:
+                return True, iteration
+            part = min(1.0, MAX_STEP / longest)
+            for _ in range(MAX_HALVINGS):
+                values = self.values + part * dp
+                self.geometry.set_values(values[: len(self.geometry.names)])
+                q_tree, closed = self.close(integrate_many(tree, self.q_tree, part * dq))
+                if closed.all():
+                    trial = self.linearize(values, q_tree)
+                    trial_cost = self.cost(values, trial.residual)
+                    if trial_cost < cost:
+                        break
+                part /= 2
+            else:
+                self.geometry.set_values(self.values[: len(self.geometry.names)])
+                return longest < STALL_TOLERANCE, iteration
+            decrease = (cost - trial_cost) / cost
+            self.values, self.q_tree, linear, cost = values, q_tree, trial, trial_cost
+            if part == 1.0 and decrease < DECREASE_TOLERANCE:
+                return True, iteration
+        return False, MAX_ITERATIONS
+
+    def fit_with_noise(self, estimated: list[BoolArray]) -> tuple[bool, int]:
+        """Fit, and estimate the standard deviations of groups of readings from their residuals, until both agree.
+
+        Parameters
+        ----------
+        estimated : list of (readings,) bool arrays
+            Groups of readings of one unknown standard deviation each.
+        """
+        total = 0
+        for _ in range(MAX_NOISE_ESTIMATES):
+            converged, iterations = self.run()
+            total += iterations
+            before = self.sigma.copy()
+            residual, redundancy = self.residuals()
+            for group in estimated:
+                self.sigma[group] = self._estimate_sigma(residual[:, group], redundancy[:, group])
+                self.sigma[group] = np.maximum(self.sigma[group], MIN_SIGMA * self.unit[group])
+            scales_only = not self.huber and estimated and estimated[0].all() and not np.isfinite(self.prior).any()
+            if scales_only or np.all(np.abs(self.sigma / before - 1) < NOISE_TOLERANCE):
+                break
+        return converged, total
+
+    def residuals(self) -> tuple[Array, Array]:
+        """Return z - h, and the redundancy of each reading: the part of its error that its residual shows."""
+        linear = self.linearize(self.values, self.q_tree)
+        weights = self.weights(linear.residual)
+        _, matrix, leverage, _ = self.equations(linear, weights)
+        u, s, _ = np.linalg.svd(matrix * self.scale, full_matrices=False)
+        u = u[: weights.size, s > RANK_TOLERANCE * s.max(initial=0.0)]
+        redundancy = 1.0 - leverage - np.sum(u * u, axis=1).reshape(weights.shape)
+        return linear.residual, np.where(self.present, np.maximum(redundancy, 0.0), 0.0)
+
+    def _estimate_sigma(self, residual: Array, redundancy: Array) -> float:
+        """Return the standard deviation of readings; with Huber's loss, from the median of their absolute values."""
+        if not self.huber:
+            return float(np.sqrt(np.sum(residual**2) / max(float(redundancy.sum()), 1e-12)))
+        clear = redundancy > MIN_REDUNDANCY
+        return float(np.median(np.abs(residual[clear]) / np.sqrt(redundancy[clear]))) / MEDIAN_OF_NORMAL if clear.any() else 0.0
