@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array
+from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.atomic_files import write_atomic
-from ckc_pin.base.linear_algebra import Factorization, one_blas_thread, pivoted_columns
+from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.tables import to_data_frame
 from ckc_pin.base.toml_writer import write_toml
@@ -144,11 +144,11 @@ class Calibration(HasSummary):
             rows.append((name, f"{number}{x.verdict}; start {x.start:.9g}"))
         listed = [f"{x} = {x.value:.6g} ± {x.std:.2g}" for x in self.combinations]
         rows += [("combinations", listed)] if listed else []
-        texts = [f"{name} {x['rms']:.2g} (expected {x['expected']:.2g})" for name, x in self.residuals.items()]
+        texts = [f"{name} {r['rms']:.2g} (expected {r['expected']:.2g})" for name, r in self.residuals.items()]
         rows += [("residuals, rms", texts), ("condition", f"{self.condition:.3g}")]
-        for name, x in self.points.items():
-            after = "unknown" if x["after"] is None else f"± {x['after']:.2g} m"
-            rows.append((f"accuracy of {name}", f"off by {x['before']:.2g} m before, {after} after"))
+        for name, accuracy in self.points.items():
+            after = "unknown" if accuracy["after"] is None else f"± {accuracy['after']:.2g} m"
+            rows.append((f"accuracy of {name}", f"off by {accuracy['before']:.2g} m before, {after} after"))
         named = [f"pose {pose}: {name} by {size:.3g} σ" for pose, name, size in self.outliers]
         rows += [("outliers", named)] if named else []
         return Summary(f"Calibration of {self.name} from {self.poses} poses", rows)
@@ -238,13 +238,15 @@ def calibrate(
     mechanism.refuse_prescribed_joints("calibrate")
     for value, choices, key in ((tracker, ("world", "unknown"), "tracker"), (loss, ("squares", "huber"), "loss")):
         if value not in choices:
-            raise InputError(f"calibrate: {key}: expected {' or '.join(map(repr, choices))}, got {describe_value(value)}")
+            raise InputError(
+                f"calibrate: {key}: expected {' or '.join(map(repr, choices))}, got {describe_value(value)}"
+            )
     readings = _read(mechanism, poses)
     names, offsets = _expand(mechanism, parameters, readings)
     all_names = [*names, *(f"encoder.{mechanism.coordinates[k]}.offset" for k in offsets)]
     all_names += TRACKER if tracker == "unknown" else ()
     priors = _by_name(prior or {}, all_names, "prior")
-    _require_enough(mechanism, readings, len(all_names) - np.count_nonzero(np.isfinite(priors)), tracker)
+    _require_enough(mechanism, readings, int(np.sum(~np.isfinite(priors))), tracker)
 
     def make_fit(values: Readings) -> Fit:
         geometry = Geometry(mechanism, names)
@@ -273,7 +275,7 @@ def _read(mechanism: Mechanism, poses: Any) -> Readings:
     require_table(poses, where, "a table of arrays by the names of readings, or the path of a CSV file")
     joints = [name for name in mechanism.coordinates if name not in mechanism.tree.free_coordinates]
     points = [f"{point}.{axis}" for point in mechanism.points for axis in AXES]
-    columns = []
+    columns: list[Array] = []
     for name, values in poses.items():
         if name not in joints and name not in points:
             there = ", ".join([*joints, *points])
@@ -283,7 +285,9 @@ def _read(mechanism: Mechanism, poses: Any) -> Readings:
         except (TypeError, ValueError):
             raise InputError(f"{where}: {name}: expected numbers, one for each pose") from None
         if column.ndim != 1 or len(column) != len(columns[0] if columns else column) or np.isinf(column).any():
-            raise InputError(f"{where}: {name}: expected finite numbers, one for each pose, as many as in other columns")
+            raise InputError(
+                f"{where}: {name}: expected finite numbers, one for each pose, as many as in other columns"
+            )
         columns.append(column)
     if not columns or not len(columns[0]):
         raise InputError(f"{where}: there are no readings; give the readings of each pose by name")
@@ -315,7 +319,7 @@ def _read_csv(path: str | Path) -> dict[str, list[float]]:
     return {name: [row[k] for row in numbers] for k, name in enumerate(header)}
 
 
-def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[list[str], Array]:
+def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[list[str], IntArray]:
     """Return the single geometric parameters, and the coordinates whose encoders have unknown offsets (InputError)."""
     patterns = [parameters] if isinstance(parameters, str) else parameters
     expected = 'names of parameters, as ["joint.*.xyz", "encoder.theta_1.offset"]'
@@ -325,18 +329,24 @@ def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[
     values = values_of(mechanism.spec, mechanism.urdf)
     geometric = {name: x for name, x in values.items() if _is_geometric(name)}
     single = list(dict.fromkeys(part for name in geometric for part in parts_of(name, geometric)))
-    encoders = {f"encoder.{name}.offset": k for name, k in zip(readings.names, readings.coordinate, strict=True) if k >= 0}
+    encoders = {
+        f"encoder.{name}.offset": k for name, k in zip(readings.names, readings.coordinate, strict=True) if k >= 0
+    }
     names: dict[str, None] = {}
     for pattern in patterns:
         require_type(pattern, str, "calibrate: parameters", expected)
         matches = [
-            name for name in (*single, *encoders) if any(fnmatchcase(x, pattern) for x in (name, name.rpartition(".")[0]))
+            name
+            for name in (*single, *encoders)
+            if any(fnmatchcase(x, pattern) for x in (name, name.rpartition(".")[0]))
         ]
         if not matches and pattern in with_components(values):
             raise InputError(f"calibrate: parameters: {pattern} has no influence on positions; leave it out")
         if not matches and pattern.startswith("encoder."):
             there = ", ".join(encoders) or "none, because poses have readings of points only"
-            raise InputError(f"calibrate: parameters: no {pattern!r}; there are {there}{suggest_name(pattern, encoders)}")
+            raise InputError(
+                f"calibrate: parameters: no {pattern!r}; there are {there}{suggest_name(pattern, encoders)}"
+            )
         if not matches and "*" not in pattern:
             require_known([pattern], with_components(geometric), "calibrate: parameters", (*ROOTS, "encoder"))
         if not matches:
@@ -348,9 +358,7 @@ def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[
 
 def _is_geometric(name: str) -> bool:
     root, _, key = split_name(name)
-    return root in ("joint", "loop", "coupling") and (
-        key.startswith("joints.") or key.rpartition(".")[2] in GEOMETRIC
-    )
+    return root in ("joint", "loop", "coupling") and (key.startswith("joints.") or key.rpartition(".")[2] in GEOMETRIC)
 
 
 def _by_name(values: Any, names: Sequence[str], key: str) -> Array:
@@ -358,9 +366,13 @@ def _by_name(values: Any, names: Sequence[str], key: str) -> Array:
     require_table(values, f"calibrate: {key}", "a table of standard deviations by name")
     array = np.full(len(names), np.inf)
     for pattern, value in values.items():
-        matches = [k for k, name in enumerate(names) if fnmatchcase(name, pattern) or name.rpartition(".")[0] == pattern]
+        matches = [
+            k for k, name in enumerate(names) if fnmatchcase(name, pattern) or name.rpartition(".")[0] == pattern
+        ]
         if not matches:
-            raise InputError(f"calibrate: {key}: no {pattern!r}; there are {', '.join(names)}{suggest_name(pattern, names)}")
+            raise InputError(
+                f"calibrate: {key}: no {pattern!r}; there are {', '.join(names)}{suggest_name(pattern, names)}"
+            )
         if not is_number(value) or not 0 < value < np.inf:
             raise InputError(f"calibrate: {key}: {pattern} = {value!r:.80}: expected a positive number")
         array[matches] = value
@@ -372,8 +384,8 @@ def _require_enough(mechanism: Mechanism, readings: Readings, unknown: int, trac
     (count, per_pose), d = readings.values.shape, mechanism.d
     if per_pose <= d:
         raise InputError(
-            f"calibrate: poses: {per_pose} readings for each pose ({', '.join(readings.names)}), but {mechanism.name} has "
-            f"{d} freedoms; measure more than {d} coordinates, or components of a point"
+            f"calibrate: poses: {per_pose} readings of each pose ({', '.join(readings.names)}), but {mechanism.name} "
+            f"has {d} freedoms; measure more than {d} coordinates or components of a point"
         )
     present = int(np.isfinite(readings.values).sum())
     if present < count * d + unknown:
@@ -396,7 +408,9 @@ def _require_radians(fit: Fit, readings: Readings, make_fit: Any) -> None:
     is_angle, miss = ~readings.in_metres, float(np.median(fit.misses()))
     if miss > MAX_MISS and is_angle.any():
         converted = np.where(is_angle, np.radians(readings.values), readings.values)
-        other = make_fit(Readings(readings.names, converted, readings.coordinate, readings.component, readings.in_metres))
+        other = make_fit(
+            Readings(readings.names, converted, readings.coordinate, readings.component, readings.in_metres)
+        )
         other.place_poses()
         if np.median(other.misses()) < miss / DEGREES_RATIO:
             named = ", ".join(name for name, angle in zip(readings.names, is_angle, strict=True) if angle)
@@ -420,7 +434,7 @@ def _require_follows(fit: Fit) -> None:
 
 def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) -> Calibration:
     linear = fit.linearize(fit.values, fit.q_tree)
-    residual, redundancy = fit.residuals()
+    residual, redundancy = fit.residuals(linear)
     weights = fit.weights(residual)
     data = linear.reduce(weights)[1] * fit.scale
     all_equations = fit.equations(linear, weights)[1] * fit.scale
@@ -459,7 +473,8 @@ def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) ->
         combinations=tuple(combinations),
         covariance=covariance * shown * shown[:, None],
         residuals={
-            name: {"rms": float(a), "expected": float(b)} for name, a, b in zip(readings.names, rms, expected, strict=True)
+            name: {"rms": float(a), "expected": float(b)}
+            for name, a, b in zip(readings.names, rms, expected, strict=True)
         },
         noise=dict(zip(readings.names, sigma.tolist(), strict=True)),
         points=_accuracy(fit, linear.by_parameter.shape[2], covariance, known),
@@ -510,19 +525,16 @@ def _accuracy(fit: Fit, p: int, covariance: Array, known: Array) -> dict[str, di
     mechanism, geometry, g = fit.mechanism, fit.geometry, len(fit.geometry.names)
     phi_p, points_p = geometry.parameter_derivatives(fit.q_tree)
     jacobian, by_q = geometry.evaluate(fit.q_tree)[1], geometry.points(fit.q_tree)[1]
-    q, z = mechanism.partition.q, mechanism.partition.z
+    z = mechanism.partition.z
     offset = np.zeros((mechanism.n, p))
     offset[fit.offsets, np.arange(g, g + len(fit.offsets))] = -1.0
-    slopes = np.zeros((*by_q.shape[:3], p))
-    for k, J in enumerate(jacobian):
-        step = np.zeros((mechanism.n, p))
-        step[q] = offset[q]
-        forced = J[:, q] @ step[q]
-        forced[:, :g] += phi_p[k]
-        factor = Factorization(J[:, z])
-        step[z] = -factor.solve(forced)
-        slopes[k] = by_q[k] @ step
-        slopes[k, ..., :g] += points_p[k]
+    offset[z] = 0.0
+    forced = jacobian @ offset
+    forced[..., :g] += phi_p
+    step = np.tile(offset, (len(jacobian), 1, 1))
+    step[:, z] = -np.linalg.pinv(jacobian[:, :, z]) @ forced
+    slopes = by_q @ step[:, None]
+    slopes[..., :g] += points_p
     error = slopes @ (fit.values - fit.start)
     scaled = slopes * fit.scale
     unknown = scaled - scaled @ known.T @ known

@@ -175,10 +175,18 @@ class Fit:
         return by_coordinate[self.readings.coordinate[self.is_encoder]]
 
     def linearize(self, values: Array, q_tree: Array, target: Array | None = None) -> Linearization:
-        """Return the linearization at closed configurations. The geometry must have these values."""
-        tree, g, (count, n) = self.geometry.tree, len(self.geometry.names), (len(q_tree), self.geometry.tree.n)
+        """Return the linearization at closed configurations. The geometry must have these values.
+
+        With a `target` in place of the readings, derivatives with respect to parameters are zero.
+        """
+        g, count, n = len(self.geometry.names), len(q_tree), self.geometry.tree.n
         points, by_q = self.geometry.points(q_tree)
-        phi_p, points_p = self.geometry.parameter_derivatives(q_tree)
+        inverse, null_space, open_rows = self._split(self.geometry.evaluate(q_tree)[1])
+        forced, points_p = np.zeros((count, n, len(values))), np.zeros((*points.shape, g))
+        if target is None:
+            phi_p, points_p = self.geometry.parameter_derivatives(q_tree)
+            forced[..., :g] = -inverse @ phi_p
+            self._require_closable(phi_p, open_rows)
         by_p = np.zeros((*points.shape, len(values)))
         by_p[..., :g] = points_p
         if self.tracker:
@@ -195,10 +203,6 @@ class Fit:
         h_p[:, encoders, g : g + len(self.offsets)] = read[:, None] == self.offsets
         h_q[:, ~self.is_encoder] = by_q.reshape(count, -1, n)[:, components]
         h_p[:, ~self.is_encoder] = by_p.reshape(count, -1, len(values))[:, components]
-        inverse, null_space, open_rows = self._split(self.geometry.evaluate(q_tree)[1])
-        forced = np.zeros((count, n, len(values)))
-        forced[..., :g] = -inverse @ phi_p
-        self._require_closable(phi_p, open_rows)
         z = self.readings.values if target is None else target
         residual = np.where(np.isfinite(z), z - self._read(values, q_tree, points), 0.0)
         return Linearization(residual, h_q @ null_space, h_p + h_q @ forced, null_space, forced)
@@ -392,7 +396,7 @@ class Fit:
             converged, iterations = self.run()
             total += iterations
             before = self.sigma.copy()
-            residual, redundancy = self.residuals()
+            residual, redundancy = self.residuals(self.linearize(self.values, self.q_tree))
             for group in estimated:
                 self.sigma[group] = self._estimate_sigma(residual[:, group], redundancy[:, group])
                 self.sigma[group] = np.maximum(self.sigma[group], MIN_SIGMA * self.unit[group])
@@ -401,9 +405,8 @@ class Fit:
                 break
         return converged, total
 
-    def residuals(self) -> tuple[Array, Array]:
+    def residuals(self, linear: Linearization) -> tuple[Array, Array]:
         """Return z - h, and the redundancy of each reading: the part of its error that its residual shows."""
-        linear = self.linearize(self.values, self.q_tree)
         weights = self.weights(linear.residual)
         _, matrix, leverage, _ = self.equations(linear, weights)
         u, s, _ = np.linalg.svd(matrix * self.scale, full_matrices=False)
@@ -416,4 +419,8 @@ class Fit:
         if not self.huber:
             return float(np.sqrt(np.sum(residual**2) / max(float(redundancy.sum()), 1e-12)))
         clear = redundancy > MIN_REDUNDANCY
-        return float(np.median(np.abs(residual[clear]) / np.sqrt(redundancy[clear]))) / MEDIAN_OF_NORMAL if clear.any() else 0.0
+        return (
+            float(np.median(np.abs(residual[clear]) / np.sqrt(redundancy[clear]))) / MEDIAN_OF_NORMAL
+            if clear.any()
+            else 0.0
+        )

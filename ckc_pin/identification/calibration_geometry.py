@@ -20,8 +20,7 @@ from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap, list_loop_frames
 from ckc_pin.mechanism.pose import Anchors
-from ckc_pin.mechanism.rows import Affine, Distance, RelativeLog, Rows
-from ckc_pin.mechanism.tree import Tree
+from ckc_pin.mechanism.rows import Affine, Distance, RelativeLog, Rows, skew
 
 __all__ = ["Geometry"]
 
@@ -87,9 +86,10 @@ class Geometry:
     def parameter_derivatives(self, q_tree: Array) -> tuple[Array, Array]:
         """Return the derivatives of phi (count, rows, p) and of the points (count, points, 3, p) at fixed q'."""
         count, p = len(q_tree), len(self.names)
-        poses = _ParameterPoses(self, self._closure_of_bodies.anchors, q_tree)
+        closure, twist = self._closure_of_bodies, self._twists(self.tree.many_kinematics(q_tree)[0])
+        poses = _ParameterPoses(self, closure.anchors, q_tree, twist)
         phi = np.zeros((count, self.closure.rows, p))
-        for group in self._closure_of_bodies.groups:
+        for group in closure.groups:
             out = group.out
             if isinstance(group, Affine):
                 zeros = np.zeros((p, self.closure.rows, self.tree.n))
@@ -97,10 +97,10 @@ class Geometry:
                 phi[:, out] = np.einsum("prn,kn->krp", slope, q_tree[:, self.tree.q_index])
                 phi[:, out] -= self._slopes.get("affine_offset", zeros[..., 0])[:, out].T
                 continue
-            residual, phi[:, out] = evaluate_group(group, self._closure_of_bodies, poses)
+            residual, phi[:, out] = evaluate_group(group, closure, poses)
             if isinstance(group, Distance) and "length" in self._slopes:
                 phi[:, out] -= (1 + residual / group.length)[..., None] * self._slopes["length"][:, out].T
-        points = _ParameterPoses(self, self._point_anchors(np.arange(len(self._axes))), q_tree)
+        points = _ParameterPoses(self, self._point_anchors(np.arange(len(self._axes))), q_tree, twist)
         return phi, points.p_jacobian
 
     # --- placements ------------------------------------------------------------------------------
@@ -133,7 +133,10 @@ class Geometry:
         """The closure whose points, directions and rotations belong to the bodies of the loops' frames."""
         first, anchors = self.tree.model.njoints, self.closure.anchors
         frames = [self._frames.get(frame, -first) for frame in self.closure.direction_frames]
-        joints = {"point_joint": first + np.arange(len(anchors.point_joint)), "direction_joint": first + np.array(frames)}
+        joints = {
+            "point_joint": first + np.arange(len(anchors.point_joint)),
+            "direction_joint": first + np.array(frames),
+        }
 
         def attach(group: Rows) -> Rows:
             if isinstance(group, RelativeLog):
@@ -151,7 +154,7 @@ class Geometry:
         bodies, local = bodies[self._point_bodies], self._offset[self._point_bodies]
         return Anchors(bodies, local, np.zeros(0, dtype=np.intp), np.zeros((0, 3)))
 
-    def twists(self, placement: Array) -> Array:
+    def _twists(self, placement: Array) -> Array:
         """Return how parameters move bodies (count, bodies, 6, p): as twists at the world's origin, in world axes."""
         rotation, origin = placement[..., :9].reshape(*placement.shape[:2], 3, 3).swapaxes(2, 3), placement[..., 9:]
         twist = np.zeros((len(placement), len(self._carriers), 6, len(self.names)))
@@ -161,9 +164,9 @@ class Geometry:
                 continue
             twist[:, body] = twist[:, carrier]
             if moved[body]:
-                at = (rotation[:, carrier] @ self._offset[body] + origin[:, carrier])[:, :, None]
+                at = rotation[:, carrier] @ self._offset[body] + origin[:, carrier]
                 turn, slide = (rotation[:, carrier] @ x[:, body].T for x in (self._turn, self._slide))
-                twist[:, body, :3] += slide + np.cross(at, turn, axis=1)
+                twist[:, body, :3] += slide + skew(at) @ turn
                 twist[:, body, 3:] += turn
         return twist
 
@@ -171,20 +174,18 @@ class Geometry:
 class _ParameterPoses(ManyPoses):
     """Points and directions of bodies at many configurations. The columns of their Jacobians are parameters."""
 
-    def __init__(self, geometry: Geometry, anchors: Anchors, q_tree: Array) -> None:
-        placement, _ = geometry.tree.many_kinematics(q_tree)
-        self.twist = geometry.twists(placement)
-        self.tree, self.anchors, self.configurations, self.count = geometry.tree, anchors, q_tree, len(q_tree)
-        self.bodies, self.columns = self.twist.shape[1], self.twist.shape[3]
-        placement = placement[:, geometry._axes].reshape(-1, 12)
-        self.rotation = placement[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
-        self.translation = placement[:, 9:]
+    def __init__(self, geometry: Geometry, anchors: Anchors, q_tree: Array, twist: Array) -> None:
+        super().__init__(geometry.tree, anchors, q_tree)
+        joint = self._joints(geometry._axes)
+        self.rotation, self.translation = self.rotation[joint], self.translation[joint]
+        self.twist, self.bodies, self.columns = twist, twist.shape[1], twist.shape[3]
 
     @lazy
     def p_jacobian(self) -> Array:
         """Derivatives of the points, shape (count, 2 k, 3, p)."""
         twist = self.twist[:, self.anchors.point_joint]
-        return np.asarray(twist[:, :, :3] + np.cross(twist[:, :, 3:], self.p[..., None], axis=2))
+        arms = skew(self.p.reshape(-1, 3)).reshape(*self.p.shape, 3)
+        return np.asarray(twist[:, :, :3] - arms @ twist[:, :, 3:])
 
     def angular(self, joint: IntArray) -> Array:
         """Angular velocities of bodies, which are numbered across all copies, shape (len(joint), 3, p)."""
