@@ -434,8 +434,8 @@ def _require_follows(fit: Fit) -> None:
 
 def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) -> Calibration:
     linear = fit.linearize(fit.values, fit.q_tree)
-    residual, redundancy = fit.residuals(linear)
-    weights = fit.weights(residual)
+    residual, redundancy = linear.residual, fit.redundancy(linear)
+    weights = fit.present / fit.sigma
     data = linear.reduce(weights)[1] * fit.scale
     all_equations = fit.equations(linear, weights)[1] * fit.scale
     identified = {k for terms in _row_space(data)[0] if len(terms) == 1 for k in terms}

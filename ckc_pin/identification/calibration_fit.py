@@ -8,7 +8,7 @@ least-squares problem in the parameters alone, so the cost is linear in the numb
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -31,15 +31,19 @@ MAX_HALVINGS = 12
 MAX_STEP = 0.3  # rad, or mechanism sizes
 STEP_TOLERANCE = 1e-13  # rad, or mechanism sizes: a shorter step ends the fit
 DECREASE_TOLERANCE = 1e-10  # relative: a step that decreases the cost by less is the last one
+ROBUST_DECREASE = 1e-6  # the same with Huber's loss
 STALL_TOLERANCE = 1e-7  # rad, or mechanism sizes: a longer step without a decrease is no convergence
 MAX_CLOSING_STEPS = 10
 HOMOTOPY_STEPS = 12  # from the assembled configuration to a pose
 POSE_STEPS = 30  # Gauss-Newton steps of a pose with fixed parameters
 MAX_NOISE_ESTIMATES = 15
-NOISE_TOLERANCE = 1e-3  # relative
+NOISE_TOLERANCE = 3e-3  # relative
 MIN_SIGMA = 1e-12  # rad, or mechanism sizes: smaller residuals are rounding errors
 MIN_REDUNDANCY = 0.1  # of readings whose residuals tell of noise one by one
-MEDIAN_OF_NORMAL = 0.6744897501960817  # of |x| of a standard normal x
+SHARE_OF_NORMAL = 0.71016  # mean of min(x^2, HUBER^2) of a standard normal x
+CURVATURE = 0.1  # of an outlier's loss in a step, relative to reweighted least squares
+MAX_REJECTIONS = 10  # rounds
+REJECTED = 5.0  # standard deviations of a residual from which a robust fit leaves a reading out
 HUBER = 1.345  # standard deviations: 95 % efficiency without outliers
 
 
@@ -139,7 +143,7 @@ class Fit:
         huber: bool,
     ) -> None:
         self.mechanism, self.geometry, self.readings, self.offsets = mechanism, geometry, readings, offsets
-        self.tracker, self.prior, self.huber = tracker, prior, huber
+        self.tracker, self.prior, self.huber, self.threshold = tracker, prior, huber, np.inf
         size = mechanism.size
         units = {"m": size, "m/rad": size, "rad/m": 1 / size}
         of_geometry = [units.get(parameter_unit(mechanism, name), 1.0) for name in geometry.names]
@@ -152,6 +156,8 @@ class Fit:
         self.values = self.start.copy()
         self.unit = np.where(readings.in_metres, mechanism.size, 1.0)  # of each reading
         self.sigma = self.unit.copy()
+        # Standard deviations of residuals, relative to those of the readings' errors. A fit hides part of each error.
+        self.visible = np.ones_like(readings.values)
         self.q_tree = np.tile(mechanism.q_tree, (len(readings.values), 1))
 
     # --- readings --------------------------------------------------------------------------------
@@ -204,7 +210,7 @@ class Fit:
         h_q[:, ~self.is_encoder] = by_q.reshape(count, -1, n)[:, components]
         h_p[:, ~self.is_encoder] = by_p.reshape(count, -1, len(values))[:, components]
         z = self.readings.values if target is None else target
-        residual = np.where(np.isfinite(z), z - self._read(values, q_tree, points), 0.0)
+        residual = np.where(self.present, z - self._read(values, q_tree, points), 0.0)
         return Linearization(residual, h_q @ null_space, h_p + h_q @ forced, null_space, forced)
 
     def _split(self, jacobian: Array) -> tuple[Array, Array, Array]:
@@ -328,17 +334,27 @@ class Fit:
 
     # --- Gauss-Newton ----------------------------------------------------------------------------
 
-    def weights(self, residual: Array) -> Array:
-        """Return the square roots of the weights of the readings; 0 where one is missing."""
-        size = np.abs(residual) / self.sigma
-        factor = np.sqrt(np.minimum(1.0, HUBER / np.maximum(size, 1e-300))) if self.huber else 1.0
-        return np.asarray(self.present * factor / self.sigma)
-
     def cost(self, values: Array, residual: Array) -> float:
-        """Return half the sum of squares, or Huber's loss, with the prior's."""
-        size = np.abs(residual) / self.sigma
-        loss = np.where(size > HUBER, HUBER * (size - HUBER / 2), size**2 / 2) if self.huber else size**2 / 2
-        return float(loss.sum() + np.sum(((values - self.start) / self.prior) ** 2) / 2)
+        """Return half the sum of squares, or Huber's loss, with that of the prior."""
+        size = self.sizes(residual)
+        loss = np.where(size > self.threshold, self.threshold * (size - self.threshold / 2), size**2 / 2)
+        return float(np.sum(self.visible**2 * loss) + np.sum(((values - self.start) / self.prior) ** 2) / 2)
+
+    def sizes(self, residual: Array) -> Array:
+        """Return absolute residuals in units of their standard deviations."""
+        return np.asarray(np.abs(residual) / (self.sigma * self.visible))
+
+    def _reweight(self, linear: Linearization) -> tuple[Linearization, Array]:
+        """Return equations and weights whose solution is the next step.
+
+        Huber's loss is linear for an outlier: it has a slope, and no curvature. Reweighted least squares gives it more
+        curvature than a secant has, and converges slowly. Less of it, at the same slope, takes a fifth of the steps.
+        """
+        size = self.sizes(linear.residual)
+        far = size > self.threshold
+        factor = np.where(far, CURVATURE * self.threshold / np.maximum(size, 1e-300), 1.0)
+        residual = np.where(far, linear.residual / CURVATURE, linear.residual)
+        return replace(linear, residual=residual), self.present * np.sqrt(factor) / self.sigma
 
     def equations(self, linear: Linearization, weights: Array) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
         """Return `Linearization.reduce` with an equation for each prior."""
@@ -354,7 +370,7 @@ class Fit:
         linear = self.linearize(self.values, self.q_tree)
         cost = self.cost(self.values, linear.residual)
         for iteration in range(1, MAX_ITERATIONS + 1):
-            residual, matrix, _, recover = self.equations(linear, self.weights(linear.residual))
+            residual, matrix, _, recover = self.equations(*self._reweight(linear))
             u, s, vt = np.linalg.svd(matrix * scale, full_matrices=False)
             rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
             reduced = u[:, :rank].T @ residual
@@ -379,12 +395,15 @@ class Fit:
                 return longest < STALL_TOLERANCE, iteration
             decrease = (cost - trial_cost) / cost
             self.values, self.q_tree, linear, cost = values, q_tree, trial, trial_cost
-            if part == 1.0 and decrease < DECREASE_TOLERANCE:
+            if part == 1.0 and decrease < (ROBUST_DECREASE if np.isfinite(self.threshold) else DECREASE_TOLERANCE):
                 return True, iteration
         return False, MAX_ITERATIONS
 
     def fit_with_noise(self, estimated: list[BoolArray]) -> tuple[bool, int]:
         """Fit, and estimate the standard deviations of groups of readings from their residuals, until both agree.
+
+        Huber's loss finds outliers. They are then left out, the worst of each pose at a time, and the final fit is one
+        of least squares, so that its standard deviations are valid.
 
         Parameters
         ----------
@@ -392,35 +411,51 @@ class Fit:
             Groups of readings of one unknown standard deviation each.
         """
         total = 0
-        for _ in range(MAX_NOISE_ESTIMATES):
-            converged, iterations = self.run()
-            total += iterations
-            before = self.sigma.copy()
-            residual, redundancy = self.residuals(self.linearize(self.values, self.q_tree))
-            for group in estimated:
-                self.sigma[group] = self._estimate_sigma(residual[:, group], redundancy[:, group])
-                self.sigma[group] = np.maximum(self.sigma[group], MIN_SIGMA * self.unit[group])
-            scales_only = not self.huber and estimated and estimated[0].all() and not np.isfinite(self.prior).any()
-            if scales_only or np.all(np.abs(self.sigma / before - 1) < NOISE_TOLERANCE):
+        for self.threshold in (np.inf, HUBER) if self.huber else (np.inf,):
+            total += self._fit_and_estimate(estimated)
+        self.threshold = np.inf
+        for _ in range(MAX_REJECTIONS if self.huber else 0):
+            size = np.where(self.present, self.sizes(self.linearize(self.values, self.q_tree).residual), 0.0)
+            worst = size >= np.maximum(size.max(axis=1, keepdims=True), REJECTED)
+            if not worst.any():
                 break
-        return converged, total
+            self.present &= ~worst
+            total += self._fit_and_estimate(estimated)
+        return self.converged, total
 
-    def residuals(self, linear: Linearization) -> tuple[Array, Array]:
-        """Return z - h, and the redundancy of each reading: the part of its error that its residual shows."""
-        weights = self.weights(linear.residual)
+    def _fit_and_estimate(self, estimated: list[BoolArray]) -> int:
+        total = 0
+        for _ in range(MAX_NOISE_ESTIMATES):
+            self.converged, iterations = self.run()
+            total += iterations
+            before, linear = self.sigma.copy(), self.linearize(self.values, self.q_tree)
+            redundancy = self.redundancy(linear)
+            for group in estimated:
+                sigma = self._estimate_sigma(linear.residual[:, group], redundancy[:, group], group)
+                self.sigma[group] = np.maximum(sigma, MIN_SIGMA * self.unit[group])
+            if np.all(np.abs(self.sigma / before - 1) < NOISE_TOLERANCE) or not self._depends_on_noise(estimated):
+                break
+        if self.huber:
+            self.visible = np.sqrt(np.maximum(redundancy, MIN_REDUNDANCY))
+        return total
+
+    def _depends_on_noise(self, estimated: list[BoolArray]) -> bool:
+        """Whether the estimate depends on the estimated standard deviations, not only on their ratios."""
+        is_common = len(estimated) == 1 and bool(estimated[0].all())
+        return np.isfinite(self.threshold) or not is_common or bool(np.isfinite(self.prior).any())
+
+    def redundancy(self, linear: Linearization) -> Array:
+        """Return the part of the error of each reading that its residual shows; 0 where a reading is missing."""
+        weights = self.present / self.sigma
         _, matrix, leverage, _ = self.equations(linear, weights)
         u, s, _ = np.linalg.svd(matrix * self.scale, full_matrices=False)
         u = u[: weights.size, s > RANK_TOLERANCE * s.max(initial=0.0)]
         redundancy = 1.0 - leverage - np.sum(u * u, axis=1).reshape(weights.shape)
-        return linear.residual, np.where(self.present, np.maximum(redundancy, 0.0), 0.0)
+        return np.where(self.present, np.maximum(redundancy, 0.0), 0.0)
 
-    def _estimate_sigma(self, residual: Array, redundancy: Array) -> float:
-        """Return the standard deviation of readings; with Huber's loss, from the median of their absolute values."""
-        if not self.huber:
-            return float(np.sqrt(np.sum(residual**2) / max(float(redundancy.sum()), 1e-12)))
-        clear = redundancy > MIN_REDUNDANCY
-        return (
-            float(np.median(np.abs(residual[clear]) / np.sqrt(redundancy[clear]))) / MEDIAN_OF_NORMAL
-            if clear.any()
-            else 0.0
-        )
+    def _estimate_sigma(self, residual: Array, redundancy: Array, group: BoolArray) -> float:
+        """Return the standard deviation of readings, with Huber's loss by his proposal 2."""
+        limit = self.threshold * self.sigma[group] * self.visible[:, group]
+        share = SHARE_OF_NORMAL if np.isfinite(self.threshold) else 1.0
+        squares = np.sum(np.minimum(np.abs(residual), limit) ** 2)
+        return float(np.sqrt(squares / max(share * float(redundancy.sum()), 1e-12)))
