@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
+    from ckc_pin.identification.calibration import Calibration, calibrate
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
 __all__ = [
+    "Calibration",
     "Check",
     "CkcError",
     "Controller",
@@ -100,6 +102,7 @@ __all__ = [
     "Terms",
     "Tracking",
     "as_ivp",
+    "calibrate",
     "check",
     "ensemble",
     "explore",
@@ -122,6 +125,7 @@ __version__ = "0.1.0"
 
 
 MODULES = {
+    "Calibration": "identification.calibration",
     "Check": "analysis.check",
     "CkcError": "errors",
     "Controller": "control.controllers",
@@ -150,6 +154,7 @@ MODULES = {
     "Terms": "dynamics.terms",
     "Tracking": "control.controllers",
     "as_ivp": "run.ivp",
+    "calibrate": "identification.calibration",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
     "explore": "explorer.explore",
@@ -164,7 +169,7 @@ MODULES = {
     "terms": "dynamics.terms",
 }
 ROOMS = (
-    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats", "kinematics",
+    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats", "identification", "kinematics",
     "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
 )  # fmt: skip
 

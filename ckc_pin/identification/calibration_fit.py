@@ -43,7 +43,7 @@ MIN_REDUNDANCY = 0.1  # of readings whose residuals tell of noise one by one
 SHARE_OF_NORMAL = 0.71016  # mean of min(x^2, HUBER^2) of a standard normal x
 CURVATURE = 0.1  # of an outlier's loss in a step, relative to reweighted least squares
 MAX_REJECTIONS = 10  # rounds
-REJECTED = 5.0  # standard deviations of a residual from which a robust fit leaves a reading out
+REJECTED = 4.5  # standard deviations of a residual from which a robust fit leaves a reading out
 HUBER = 1.345  # standard deviations: 95 % efficiency without outliers
 
 

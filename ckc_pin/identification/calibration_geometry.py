@@ -86,6 +86,8 @@ class Geometry:
     def parameter_derivatives(self, q_tree: Array) -> tuple[Array, Array]:
         """Return the derivatives of phi (count, rows, p) and of the points (count, points, 3, p) at fixed q'."""
         count, p = len(q_tree), len(self.names)
+        if not p:
+            return np.zeros((count, self.closure.rows, 0)), np.zeros((count, len(self._point_bodies), 3, 0))
         closure, twist = self._closure_of_bodies, self._twists(self.tree.many_kinematics(q_tree)[0])
         poses = _ParameterPoses(self, closure.anchors, q_tree, twist)
         phi = np.zeros((count, self.closure.rows, p))
