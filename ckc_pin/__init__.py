@@ -169,8 +169,8 @@ MODULES = {
     "terms": "dynamics.terms",
 }
 ROOMS = (
-    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats", "identification", "kinematics",
-    "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
+    "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats",
+    "identification", "kinematics", "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
 )  # fmt: skip
 
 

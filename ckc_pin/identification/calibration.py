@@ -222,7 +222,8 @@ def calibrate(
         Frame of the points' readings. The placement of an unknown one is estimated: ``tracker.x`` to ``tracker.rz``,
         position and rotation vector in the world.
     loss : "squares" or "huber"
-        Huber's loss limits the influence of outliers.
+        Huber's loss finds outliers, which are then left out. It is meant for a few gross errors; its standard
+        deviations are a few percent too small.
 
     Returns
     -------
@@ -423,8 +424,8 @@ def _require_follows(fit: Fit) -> None:
     if np.median(misses) > MAX_MISS:
         worst = int(np.argmax(misses))
         raise InputError(
-            f"calibrate: the mechanism cannot follow the readings: they differ by {np.median(misses):.2g} rad, or of its "
-            f"size, in the median of the poses, and by {misses[worst]:.2g} in pose {worst}; they may belong to another "
+            f"calibrate: the mechanism cannot follow the readings: they differ by {np.median(misses):.2g} rad, or of "
+            f"its size, in the median of the poses, by {misses[worst]:.2g} in pose {worst}; they may belong to another "
             "assembly branch (choose it by q_guess), or an encoder turns the other way or has an unknown offset"
         )
 
@@ -433,8 +434,8 @@ def _require_follows(fit: Fit) -> None:
 
 
 def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) -> Calibration:
-    linear = fit.linearize(fit.values, fit.q_tree)
-    residual, redundancy = linear.residual, fit.redundancy(linear)
+    linear, redundancy = fit.linear, fit.redundancy()
+    residual = np.nan_to_num(fit.readings.values - fit.predict(fit.values, fit.q_tree))
     weights = fit.present / fit.sigma
     data = linear.reduce(weights)[1] * fit.scale
     all_equations = fit.equations(linear, weights)[1] * fit.scale
@@ -460,18 +461,19 @@ def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) ->
             estimates[name] = Estimate(float(fit.values[k]), float(np.sqrt(covariance[k, k])), start, verdict)
         else:
             estimates[name] = Estimate(None, None, start, COMBINED if k in seen else UNKNOWN)
-    shown = np.where([k in alone for k in range(len(names))], 1.0, np.nan)
+    has_value = np.where([k in alone for k in range(len(names))], 1.0, np.nan)
     readings = fit.readings
     count = np.maximum(fit.present.sum(axis=0), 1)
-    rms, sigma = np.sqrt((residual**2).sum(axis=0) / count), fit.sigma
+    rms, sigma = np.sqrt((linear.residual**2).sum(axis=0) / count), fit.sigma
     expected = sigma * np.sqrt(redundancy.sum(axis=0) / count)
-    sizes = np.abs(residual) / (sigma * np.sqrt(np.maximum(redundancy, 1e-6)))
+    shown = np.where(fit.present, np.maximum(redundancy, 1e-6), 1.0)  # all of the error of a reading that was left out
+    sizes = np.abs(residual) / (sigma * np.sqrt(shown))
     far = sorted(np.argwhere(sizes > OUTLIER).tolist(), key=lambda at: -sizes[at[0], at[1]])
     return Calibration(
         name=fit.mechanism.name,
         parameters=estimates,
         combinations=tuple(combinations),
-        covariance=covariance * shown * shown[:, None],
+        covariance=covariance * has_value * has_value[:, None],
         residuals={
             name: {"rms": float(a), "expected": float(b)}
             for name, a, b in zip(readings.names, rms, expected, strict=True)

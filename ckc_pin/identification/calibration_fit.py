@@ -44,6 +44,7 @@ SHARE_OF_NORMAL = 0.71016  # mean of min(x^2, HUBER^2) of a standard normal x
 CURVATURE = 0.1  # of an outlier's loss in a step, relative to reweighted least squares
 MAX_REJECTIONS = 10  # rounds
 REJECTED = 4.5  # standard deviations of a residual from which a robust fit leaves a reading out
+POSE_TOLERANCE = 1e-4  # rad, or mechanism sizes: step that ends them
 HUBER = 1.345  # standard deviations: 95 % efficiency without outliers
 
 
@@ -151,11 +152,12 @@ class Fit:
         # Steps of parameters are compared in radians and in units of the mechanism's size.
         self.scale = np.array([*of_geometry, *geometry.tree.step_scale[offsets], *of_tracker])
         self.is_encoder = readings.coordinate >= 0
-        self.present = np.isfinite(readings.values)
+        self.present = np.isfinite(readings.values)  # a robust fit leaves outliers out
         self.start = np.concatenate([geometry.values, np.zeros(len(offsets) + 6 * tracker)])
         self.values = self.start.copy()
         self.unit = np.where(readings.in_metres, mechanism.size, 1.0)  # of each reading
         self.sigma = self.unit.copy()
+        self.linear: Linearization  # at the estimate, after a fit
         # Standard deviations of residuals, relative to those of the readings' errors. A fit hides part of each error.
         self.visible = np.ones_like(readings.values)
         self.q_tree = np.tile(mechanism.q_tree, (len(readings.values), 1))
@@ -295,7 +297,7 @@ class Fit:
             step *= np.minimum(1.0, MAX_STEP / np.maximum(size, MAX_STEP))[:, None]
             trial, closed = self.close(integrate_many(self.geometry.tree, q_tree, step))
             q_tree = np.where(closed[:, None], trial, q_tree)
-            if np.where(closed, size, 0.0).max(initial=0.0) < 1e-8:
+            if np.where(closed, size, 0.0).max(initial=0.0) < POSE_TOLERANCE:
                 break
         return q_tree
 
@@ -367,10 +369,10 @@ class Fit:
     def run(self) -> tuple[bool, int]:
         """Fit all parameters and poses from the present state. Return whether that converged, and the iterations."""
         scale, tree = self.scale, self.geometry.tree
-        linear = self.linearize(self.values, self.q_tree)
-        cost = self.cost(self.values, linear.residual)
+        self.linear = self.linearize(self.values, self.q_tree)
+        cost = self.cost(self.values, self.linear.residual)
         for iteration in range(1, MAX_ITERATIONS + 1):
-            residual, matrix, _, recover = self.equations(*self._reweight(linear))
+            residual, matrix, _, recover = self.equations(*self._reweight(self.linear))
             u, s, vt = np.linalg.svd(matrix * scale, full_matrices=False)
             rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
             reduced = u[:, :rank].T @ residual
@@ -394,7 +396,7 @@ class Fit:
                 self.geometry.set_values(self.values[: len(self.geometry.names)])
                 return longest < STALL_TOLERANCE, iteration
             decrease = (cost - trial_cost) / cost
-            self.values, self.q_tree, linear, cost = values, q_tree, trial, trial_cost
+            self.values, self.q_tree, self.linear, cost = values, q_tree, trial, trial_cost
             if part == 1.0 and decrease < (ROBUST_DECREASE if np.isfinite(self.threshold) else DECREASE_TOLERANCE):
                 return True, iteration
         return False, MAX_ITERATIONS
@@ -410,12 +412,13 @@ class Fit:
         estimated : list of (readings,) bool arrays
             Groups of readings of one unknown standard deviation each.
         """
-        total = 0
-        for self.threshold in (np.inf, HUBER) if self.huber else (np.inf,):
+        total = self._fit_and_estimate(estimated)
+        if self.huber:
+            self.threshold = HUBER
             total += self._fit_and_estimate(estimated)
-        self.threshold = np.inf
+            self.threshold = np.inf
         for _ in range(MAX_REJECTIONS if self.huber else 0):
-            size = np.where(self.present, self.sizes(self.linearize(self.values, self.q_tree).residual), 0.0)
+            size = self.sizes(self.linear.residual)
             worst = size >= np.maximum(size.max(axis=1, keepdims=True), REJECTED)
             if not worst.any():
                 break
@@ -428,10 +431,9 @@ class Fit:
         for _ in range(MAX_NOISE_ESTIMATES):
             self.converged, iterations = self.run()
             total += iterations
-            before, linear = self.sigma.copy(), self.linearize(self.values, self.q_tree)
-            redundancy = self.redundancy(linear)
+            before, redundancy = self.sigma.copy(), self.redundancy()
             for group in estimated:
-                sigma = self._estimate_sigma(linear.residual[:, group], redundancy[:, group], group)
+                sigma = self._estimate_sigma(self.linear.residual[:, group], redundancy[:, group], group)
                 self.sigma[group] = np.maximum(sigma, MIN_SIGMA * self.unit[group])
             if np.all(np.abs(self.sigma / before - 1) < NOISE_TOLERANCE) or not self._depends_on_noise(estimated):
                 break
@@ -444,10 +446,10 @@ class Fit:
         is_common = len(estimated) == 1 and bool(estimated[0].all())
         return np.isfinite(self.threshold) or not is_common or bool(np.isfinite(self.prior).any())
 
-    def redundancy(self, linear: Linearization) -> Array:
+    def redundancy(self) -> Array:
         """Return the part of the error of each reading that its residual shows; 0 where a reading is missing."""
         weights = self.present / self.sigma
-        _, matrix, leverage, _ = self.equations(linear, weights)
+        _, matrix, leverage, _ = self.equations(self.linear, weights)
         u, s, _ = np.linalg.svd(matrix * self.scale, full_matrices=False)
         u = u[: weights.size, s > RANK_TOLERANCE * s.max(initial=0.0)]
         redundancy = 1.0 - leverage - np.sum(u * u, axis=1).reshape(weights.shape)

@@ -1,4 +1,4 @@
-"""The five-bar in closed form, and the Cramer-Rao bound of its calibration by differences. It shares no code with ours."""
+"""The five-bar in closed form, and the Cramer-Rao bound by differences. Nothing here imports ckc_pin."""
 
 from __future__ import annotations
 

@@ -17,9 +17,12 @@ ENCODERS = columns(READINGS, ("theta_1", "theta_2", "theta_3", "theta_4"))
 TIP = columns(READINGS, ("theta_1", "theta_3", "tip.x", "tip.y"))
 NAMES = list(LENGTHS)[:4]
 
+FOLDED = {**ENCODERS, "theta_2": -ENCODERS["theta_2"], "theta_4": -ENCODERS["theta_4"]}
+DEGREES = {name: np.degrees(x) for name, x in ENCODERS.items()}
+
 CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "nothing": (lambda: calibrate("five_bar", ENCODERS, []), "nothing to calibrate"),
-    "type": (lambda: calibrate("five_bar", ENCODERS, [3]), "parameters: expected names of parameters"),  # type: ignore[list-item]
+    "type": (lambda: calibrate("five_bar", ENCODERS, [3]), "expected names of parameters"),  # type: ignore[list-item]
     "unknown parameter": (lambda: calibrate("five_bar", ENCODERS, ["joint.theta_9.xyz.x"]), "no 'joint.theta_9.xyz.x'"),
     "unknown pattern": (lambda: calibrate("five_bar", ENCODERS, ["joint.*.length"]), "matches no geometric parameter"),
     "mass": (lambda: calibrate("five_bar", ENCODERS, ["link.link_1.mass"]), "no influence on positions"),
@@ -37,17 +40,17 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: calibrate("five_bar", {k: x[:1] for k, x in ENCODERS.items()}, NAMES),
         "measure at least 2 poses",
     ),
-    "degrees": (lambda: calibrate("five_bar", {k: np.degrees(x) for k, x in ENCODERS.items()}, NAMES), "look like degrees"),
+    "degrees": (lambda: calibrate("five_bar", DEGREES, NAMES), "look like degrees"),
     "degrees, with a point": (
         lambda: calibrate("five_bar", {k: x if "tip" in k else np.degrees(x) for k, x in TIP.items()}, NAMES),
         "theta_1, theta_3 look like degrees",
     ),
     "other branch": (
-        lambda: calibrate("five_bar", {**ENCODERS, "theta_2": -ENCODERS["theta_2"], "theta_4": -ENCODERS["theta_4"]}, NAMES),
+        lambda: calibrate("five_bar", FOLDED, NAMES),
         "cannot follow the readings.*another assembly branch",
     ),
     "redundant rows": (lambda: calibrate("bricard", bricard_poses(), ["joint.*.rpy"]), "redundant"),
-    "noise": (lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"theta_1": 0.0}), "theta_1 = 0.0: expected a positive"),
+    "noise": (lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"theta_1": 0.0}), "expected a positive number"),
     "noise of nothing": (lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"tip.x": 1.0}), "noise: no 'tip.x'"),
     "prior": (lambda: calibrate("five_bar", ENCODERS, NAMES, prior={"gravity": 1.0}), "prior: no 'gravity'"),
     "loss": (lambda: calibrate("five_bar", ENCODERS, NAMES, loss="l1"), "loss: expected 'squares' or 'huber', got 'l1'"),
