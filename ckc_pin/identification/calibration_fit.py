@@ -30,7 +30,7 @@ MAX_ITERATIONS = 60  # of the Gauss-Newton method
 MAX_HALVINGS = 12
 MAX_STEP = 0.3  # rad, or mechanism sizes
 STEP_TOLERANCE = 1e-13  # rad, or mechanism sizes: a shorter step ends the fit
-DECREASE_TOLERANCE = 1e-10  # relative: a step that decreases the cost by less is the last one
+DECREASE_TOLERANCE = 1e-11  # relative: parameters that can decrease the cost by no more have converged
 ROBUST_DECREASE = 1e-6  # the same with Huber's loss
 STALL_TOLERANCE = 1e-7  # rad, or mechanism sizes: a longer step without a decrease is no convergence
 MAX_CLOSING_STEPS = 10
@@ -379,7 +379,10 @@ class Fit:
             dp = scale * (vt[:rank].T @ (reduced / s[:rank]))
             dq = recover(dp)
             longest = max(float(np.abs(dp / scale).max(initial=0.0)), float(tree.step_size(dq).max(initial=0.0)))
-            if longest < STEP_TOLERANCE or cost == 0.0:
+            tolerance = ROBUST_DECREASE if np.isfinite(self.threshold) else DECREASE_TOLERANCE
+            # The motions of the poses follow those of the parameters, once there was a step.
+            is_small = iteration > 1 and reduced @ reduced / 2 <= tolerance * cost
+            if longest < STEP_TOLERANCE or is_small:
                 return True, iteration
             part = min(1.0, MAX_STEP / longest)
             for _ in range(MAX_HALVINGS):
@@ -395,10 +398,7 @@ class Fit:
             else:
                 self.geometry.set_values(self.values[: len(self.geometry.names)])
                 return longest < STALL_TOLERANCE, iteration
-            decrease = (cost - trial_cost) / cost
             self.values, self.q_tree, self.linear, cost = values, q_tree, trial, trial_cost
-            if part == 1.0 and decrease < (ROBUST_DECREASE if np.isfinite(self.threshold) else DECREASE_TOLERANCE):
-                return True, iteration
         return False, MAX_ITERATIONS
 
     def fit_with_noise(self, estimated: list[BoolArray]) -> tuple[bool, int]:
