@@ -274,7 +274,8 @@ def test_measured_point_or_prior_makes_the_size_known(five_bar: Mechanism) -> No
 def test_mean_of_prior_and_readings_is_weighted() -> None:
     """One encoder on a pendulum whose tip is measured: the offset's estimate is a weighted mean."""
     urdf = """<robot name="p"><link name="base"/><link name="rod"/>
-      <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 0 1"/></joint></robot>"""
+      <joint name="hinge" type="continuous">
+        <parent link="base"/><child link="rod"/><axis xyz="0 0 1"/></joint></robot>"""
     frame = {"link": "rod", "xyz": [1.0, 0.0, 0.0]}
     pendulum = ckc_pin.Mechanism.from_urdf(urdf, points=[{"name": "tip", "frame": frame}])
     angles, offset, sigma, prior = np.linspace(-1, 1, 9), 0.03, 1e-2, 4e-3
