@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -37,7 +37,6 @@ MAX_MISS = 0.02  # rad, or mechanism sizes: median distance of a mechanism that 
 DEGREES_RATIO = 5.0  # readings are in degrees if converted ones are met so much better
 MIN_COEFFICIENT = 1e-6  # of a combination, with parameters in radians and mechanism sizes
 OUTLIER = 4.5  # standard deviations of a residual
-MAX_NAMED = 6  # outliers and combinations that a summary lists
 
 
 class Estimate(NamedTuple):
@@ -101,7 +100,7 @@ class Calibration(HasSummary):
     points : dict of str to dict
         Accuracy of named points whose position follows from the independent encoders, m, root mean square over the
         poses: ``before``, the error that the start values make; ``after``, the standard deviation that remains, None if
-        it depends on parameters that are not known.
+        it depends on unknown parameters.
     condition : float
         Condition number of the readings' derivatives, with columns of unit norm; of what is identified.
     poses : int
@@ -404,7 +403,7 @@ def _require_enough(mechanism: Mechanism, readings: Readings, unknown: int, trac
             )
 
 
-def _require_radians(fit: Fit, readings: Readings, make_fit: Any) -> None:
+def _require_radians(fit: Fit, readings: Readings, make_fit: Callable[[Readings], Fit]) -> None:
     """Refuse encoders in degrees (InputError)."""
     is_angle, miss = ~readings.in_metres, float(np.median(fit.misses()))
     if miss > MAX_MISS and is_angle.any():
@@ -434,85 +433,101 @@ def _require_follows(fit: Fit) -> None:
 
 
 def _report(fit: Fit, names: Sequence[str], converged: bool, iterations: int) -> Calibration:
-    linear, redundancy = fit.linear, fit.redundancy()
-    residual = np.nan_to_num(fit.readings.values - fit.predict(fit.values, fit.q_tree))
+    linear, redundancy, readings = fit.linear, fit.redundancy(), fit.readings
     weights = fit.present / fit.sigma
-    data = linear.reduce(weights)[1] * fit.scale
-    all_equations = fit.equations(linear, weights)[1] * fit.scale
-    identified = {k for terms in _row_space(data)[0] if len(terms) == 1 for k in terms}
-    rows, known, covariance = _row_space(all_equations)
-    covariance = fit.scale[:, None] * covariance * fit.scale
-    estimates, combinations, seen = dict[str, Estimate](), [], set[int]()
-    for terms in rows:
-        seen |= set(terms)
-        if len(terms) > 1:
-            vector = np.zeros(len(names))
-            first = next(iter(terms))
-            for k, coefficient in terms.items():
-                vector[k] = coefficient * fit.scale[first] / fit.scale[k]
-            std = float(np.sqrt(vector @ covariance @ vector))
-            named = {names[k]: float(vector[k]) for k in terms}
-            combinations.append(Combination(named, float(vector @ fit.values), std))
-    alone = {k for terms in rows if len(terms) == 1 for k in terms}
-    for k, name in enumerate(names):
-        start = float(fit.start[k])
-        if k in alone:
-            verdict = IDENTIFIED if k in identified else BY_PRIOR
-            estimates[name] = Estimate(float(fit.values[k]), float(np.sqrt(covariance[k, k])), start, verdict)
-        else:
-            estimates[name] = Estimate(None, None, start, COMBINED if k in seen else UNKNOWN)
-    has_value = np.where([k in alone for k in range(len(names))], 1.0, np.nan)
-    readings = fit.readings
+    by_data = _row_space(linear.reduce(weights)[1] * fit.scale)
+    matrix = fit.equations(linear, weights)[1] * fit.scale
+    space = _row_space(matrix)
+    covariance = fit.scale[:, None] * space.covariance * fit.scale
+    combinations = tuple(_combine(fit, names, terms, covariance) for terms in space.rows if len(terms) > 1)
+    has_value = np.where([k in space.single for k in range(len(names))], 1.0, np.nan)
     count = np.maximum(fit.present.sum(axis=0), 1)
-    rms, sigma = np.sqrt((linear.residual**2).sum(axis=0) / count), fit.sigma
-    expected = sigma * np.sqrt(redundancy.sum(axis=0) / count)
-    shown = np.where(fit.present, np.maximum(redundancy, 1e-6), 1.0)  # all of the error of a reading that was left out
-    sizes = np.abs(residual) / (sigma * np.sqrt(shown))
-    far = sorted(np.argwhere(sizes > OUTLIER).tolist(), key=lambda at: -sizes[at[0], at[1]])
+    rms = np.sqrt((linear.residual**2).sum(axis=0) / count)
+    expected = fit.sigma * np.sqrt(redundancy.sum(axis=0) / count)
+    status = "converged" if converged else "not converged"
     return Calibration(
         name=fit.mechanism.name,
-        parameters=estimates,
-        combinations=tuple(combinations),
+        parameters={name: _estimate(fit, k, space, by_data, covariance) for k, name in enumerate(names)},
+        combinations=combinations,
         covariance=covariance * has_value * has_value[:, None],
         residuals={
             name: {"rms": float(a), "expected": float(b)}
             for name, a, b in zip(readings.names, rms, expected, strict=True)
         },
-        noise=dict(zip(readings.names, sigma.tolist(), strict=True)),
-        points=_accuracy(fit, linear.by_parameter.shape[2], covariance, known),
-        condition=_condition(all_equations),
+        noise=dict(zip(readings.names, fit.sigma.tolist(), strict=True)),
+        points=_accuracy(fit, len(names), covariance, space.basis),
+        condition=_condition(matrix),
         poses=len(fit.q_tree),
-        outliers=tuple((k, readings.names[j], float(sizes[k, j])) for k, j in far),
+        outliers=tuple(_find_outliers(fit, redundancy)),
         coordinates=np.array([fit.geometry.tree.to_coordinates(q) for q in fit.q_tree]),
         converged=converged,
-        message=f"converged in {iterations} iterations" if converged else f"not converged in {iterations} iterations",
+        message=f"{status} in {iterations} iterations",
     )
 
 
-def _row_space(matrix: Array) -> tuple[list[dict[int, float]], Array, Array]:
-    """Return what equations determine of unknowns in radians and mechanism sizes, weighted by their errors.
+def _estimate(fit: Fit, k: int, space: _RowSpace, by_data: _RowSpace, covariance: Array) -> Estimate:
+    start = float(fit.start[k])
+    if k in space.single:
+        verdict = IDENTIFIED if k in by_data.single else BY_PRIOR
+        return Estimate(float(fit.values[k]), float(np.sqrt(covariance[k, k])), start, verdict)
+    is_combined = any(k in terms for terms in space.rows)
+    return Estimate(None, None, start, COMBINED if is_combined else UNKNOWN)
 
-    Returns
-    -------
-    list of dict of int to float
+
+def _combine(fit: Fit, names: Sequence[str], terms: Mapping[int, float], covariance: Array) -> Combination:
+    """Return a combination of scaled parameters in their own units."""
+    at, first = list(terms), next(iter(terms))
+    coefficients = np.array(list(terms.values())) * fit.scale[first] / fit.scale[at]
+    std = float(np.sqrt(coefficients @ covariance[np.ix_(at, at)] @ coefficients))
+    named = {names[k]: float(c) for k, c in zip(at, coefficients, strict=True)}
+    return Combination(named, float(coefficients @ fit.values[at]), std)
+
+
+def _find_outliers(fit: Fit, redundancy: Array) -> Iterator[tuple[int, str, float]]:
+    """Yield readings with large residuals, the largest first; all of the error of one that was left out is visible."""
+    residual = np.nan_to_num(fit.readings.values - fit.predict(fit.values, fit.q_tree))
+    visible = np.where(fit.present, np.maximum(redundancy, 1e-6), 1.0)
+    sizes = np.abs(residual) / (fit.sigma * np.sqrt(visible))
+    for k in np.argsort(-sizes, axis=None)[: np.count_nonzero(sizes > OUTLIER)]:
+        pose, column = np.unravel_index(k, sizes.shape)
+        yield int(pose), fit.readings.names[column], float(sizes[pose, column])
+
+
+class _RowSpace(NamedTuple):
+    """What equations determine of unknowns in radians and mechanism sizes, weighted by their errors.
+
+    Attributes
+    ----------
+    rows : list of dict of int to float
         A basis of the linear combinations that are determined: coefficients by unknown, 1 for the first. An unknown
         that is determined itself is a combination of its own.
-    known : (rank, unknowns) array
-        An orthonormal basis.
+    single : set of int
+        Unknowns that are determined themselves.
+    basis : (rank, unknowns) array
+        The same space, orthonormal.
     covariance : (unknowns, unknowns) array
         Of combinations that are determined.
     """
+
+    rows: list[dict[int, float]]
+    single: set[int]
+    basis: Array
+    covariance: Array
+
+
+def _row_space(matrix: Array) -> _RowSpace:
     _, s, vt = np.linalg.svd(matrix, full_matrices=False)
-    # A combination whose standard deviation is larger than a radian, or than the mechanism, is not known.
+    # A combination whose standard deviation is larger than a radian, or than the mechanism, is unknown.
     rank = int(np.sum(s > max(RANK_TOLERANCE * s.max(initial=0.0), 1.0)))
-    known = vt[:rank]
-    pivots = np.sort(pivoted_columns(known)[0][:rank])
-    reduced = np.linalg.solve(known[:, pivots], known) if rank else known
+    basis = vt[:rank]
+    pivots = np.sort(pivoted_columns(basis)[0][:rank])
+    reduced = np.linalg.solve(basis[:, pivots], basis) if rank else basis
     rows = []
     for pivot, row in zip(pivots.tolist(), reduced, strict=True):
         others = {k: float(row[k]) for k in np.flatnonzero(np.abs(row) > MIN_COEFFICIENT).tolist() if k != pivot}
         rows.append({pivot: 1.0, **others})
-    return rows, known, (known.T / s[:rank] ** 2) @ known
+    single = {k for terms in rows if len(terms) == 1 for k in terms}
+    return _RowSpace(rows, single, basis, (basis.T / s[:rank] ** 2) @ basis)
 
 
 def _condition(matrix: Array) -> float:
@@ -522,7 +537,7 @@ def _condition(matrix: Array) -> float:
     return float(s[0] / s[-1]) if len(s) else float("nan")
 
 
-def _accuracy(fit: Fit, p: int, covariance: Array, known: Array) -> dict[str, dict[str, float | None]]:
+def _accuracy(fit: Fit, p: int, covariance: Array, basis: Array) -> dict[str, dict[str, float | None]]:
     """Return the accuracy of named points, with the readings of the independent encoders as they are."""
     mechanism, geometry, g = fit.mechanism, fit.geometry, len(fit.geometry.names)
     phi_p, points_p = geometry.parameter_derivatives(fit.q_tree)
@@ -539,7 +554,7 @@ def _accuracy(fit: Fit, p: int, covariance: Array, known: Array) -> dict[str, di
     slopes[..., :g] += points_p
     error = slopes @ (fit.values - fit.start)
     scaled = slopes * fit.scale
-    unknown = scaled - scaled @ known.T @ known
+    unknown = scaled - scaled @ basis.T @ basis
     variance = np.einsum("kpai,ij,kpaj->kp", slopes, covariance, slopes)
     result = dict[str, dict[str, float | None]]()
     for j, name in enumerate(mechanism.points):

@@ -361,9 +361,9 @@ class Fit:
     def equations(self, linear: Linearization, weights: Array) -> tuple[Array, Array, Array, Callable[[Array], Array]]:
         """Return `Linearization.reduce` with an equation for each prior."""
         residual, matrix, leverage, recover = linear.reduce(weights)
-        known = np.flatnonzero(np.isfinite(self.prior))
-        rows = np.eye(len(self.prior))[known] / self.prior[known, None]
-        offset = (self.start - self.values)[known] / self.prior[known]
+        at = np.flatnonzero(np.isfinite(self.prior))
+        rows = np.eye(len(self.prior))[at] / self.prior[at, None]
+        offset = (self.start - self.values)[at] / self.prior[at]
         return np.concatenate([residual, offset]), np.vstack([matrix, rows]), leverage, recover
 
     def run(self) -> tuple[bool, int]:

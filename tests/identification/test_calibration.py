@@ -115,7 +115,7 @@ def test_noise_is_estimated_from_residuals(five_bar: Mechanism) -> None:
 def test_noise_of_angles_and_lengths_is_estimated_separately(five_bar: Mechanism) -> None:
     random = np.random.default_rng(1)
     sigma = np.array([2e-3, 2e-3, 1e-4, 1e-4])
-    unknowns = np.concatenate([TRUTH, draw_motors(random, 200).ravel()])
+    unknowns = np.concatenate([TRUTH, draw_motors(random, 100).ravel()])
     exact = predict(unknowns)[:, [0, 2, 4, 5]]
     noisy = exact + sigma * random.standard_normal(exact.shape)
     result = calibrate(five_bar, dict(zip(MOTORS_AND_TIP, noisy.T, strict=True)), NAMES)
