@@ -35,6 +35,8 @@ ROBUST_DECREASE = 1e-6  # the same with Huber's loss
 STALL_TOLERANCE = 1e-7  # rad, or mechanism sizes: a longer step without a decrease is no convergence
 MAX_CLOSING_STEPS = 10
 HOMOTOPY_STEPS = 12  # from the assembled configuration to a pose
+MAX_RETRIES = 3  # for poses that miss their readings
+MIN_PART = 1e-3  # of a step of a pose
 POSE_STEPS = 30  # Gauss-Newton steps of a pose with fixed parameters
 MAX_NOISE_ESTIMATES = 15
 NOISE_TOLERANCE = 3e-3  # relative
@@ -269,16 +271,17 @@ class Fit:
         if self.tracker:
             weights = weights * self.is_encoder
         read = readings.coordinate[self.is_encoder]
-        guess = np.tile(self.mechanism.q_tree, (len(readings.values), 1))
-        if len(set(read.tolist())) == tree.n and self.present[:, self.is_encoder].all():
-            guess[:, tree.q_index[read]] = readings.values[:, self.is_encoder] - self._offset(self.values)
-            self.q_tree = self._fit_poses(self.close(guess)[0], readings.values, weights)
+        measured = np.tile(self.mechanism.q_tree, (len(readings.values), 1))
+        angles = readings.values[:, self.is_encoder] - self._offset(self.values)
+        at = tree.q_index[read]
+        measured[:, at] = np.where(self.present[:, self.is_encoder], angles, measured[:, at])
+        if len(read) == tree.n:
+            self.q_tree = self._fit_poses(self.close(measured)[0], readings.values, weights)
         else:
-            start = self.predict(self.values, guess)
-            for part in np.linspace(0.0, 1.0, HOMOTOPY_STEPS + 1)[1:]:
-                guess = self._fit_poses(guess, start + part * (readings.values - start), weights, 2)
-            self.q_tree = self._fit_poses(guess, readings.values, weights)
-            self._retry_from_neighbours(weights)
+            self.q_tree = self._follow(self.q_tree, weights)
+            self._retry(lambda _: self.close(measured)[0], weights)
+            for _ in range(MAX_RETRIES):
+                self._retry(lambda met: self._follow(self._nearest(met, weights), weights), weights)
         if self.tracker:
             self._place_tracker()
             self.q_tree = self._fit_poses(self.q_tree, readings.values, self.present / self.unit)
@@ -291,29 +294,45 @@ class Fit:
         return np.asarray(np.linalg.norm(weights * residual, axis=1) / np.sqrt(count))
 
     def _fit_poses(self, q_tree: Array, target: Array, weights: Array, steps: int = POSE_STEPS) -> Array:
+        """Move each pose along the manifold towards its target by Gauss-Newton steps that come nearer to it."""
+        part = np.ones(len(q_tree))
+        linear, zero = self.linearize(self.values, q_tree, target), np.zeros(len(self.values))
         for _ in range(steps):
-            step = self.linearize(self.values, q_tree, target).reduce(weights)[3](np.zeros(len(self.values)))
+            step = linear.reduce(weights)[3](zero) * part[:, None]
             size = self.geometry.tree.step_size(step)
             step *= np.minimum(1.0, MAX_STEP / np.maximum(size, MAX_STEP))[:, None]
             trial, closed = self.close(integrate_many(self.geometry.tree, q_tree, step))
-            q_tree = np.where(closed[:, None], trial, q_tree)
-            if np.where(closed, size, 0.0).max(initial=0.0) < POSE_TOLERANCE:
+            after = self.linearize(self.values, trial, target)
+            before, now = (np.linalg.norm(weights * x.residual, axis=1) for x in (linear, after))
+            nearer = closed & (now < before)
+            q_tree = np.where(nearer[:, None], trial, q_tree)
+            part = np.where(nearer, np.minimum(1.0, 2 * part), part / 4)
+            if np.where(part > MIN_PART, size, 0.0).max(initial=0.0) < POSE_TOLERANCE:
                 break
+            linear = self.linearize(self.values, q_tree, target)
         return q_tree
 
-    def _retry_from_neighbours(self, weights: Array) -> None:
-        """Start poses that miss their readings again from the nearest pose that meets them."""
-        for _ in range(3):
-            misses = self.misses(weights)
-            bad = misses > 5 * np.median(misses) + 1e-6
-            if not bad.any() or bad.all():
-                return
-            values = np.nan_to_num(self.readings.values) * weights
-            distance = np.linalg.norm(values[:, None] - values[None, ~bad], axis=2)
-            start, before = np.flatnonzero(~bad)[distance.argmin(axis=1)], self.q_tree
-            trial = self._fit_poses(np.where(bad[:, None], before[start], before), self.readings.values, weights)
-            self.q_tree = trial
-            self.q_tree = np.where((self.misses(weights) < misses)[:, None], trial, before)
+    def _follow(self, q_tree: Array, weights: Array) -> Array:
+        """Follow the straight line from the readings at closed configurations to those of the poses."""
+        start, values = self.predict(self.values, q_tree), self.readings.values
+        for part in np.linspace(0.0, 1.0, HOMOTOPY_STEPS + 1)[1:]:
+            q_tree = self._fit_poses(q_tree, start + part * (values - start), weights, 2)
+        return self._fit_poses(q_tree, values, weights)
+
+    def _retry(self, find: Callable[[BoolArray], Array], weights: Array) -> None:
+        """Start poses that miss their readings again where a function of the poses that meet theirs says."""
+        misses = self.misses(weights)
+        bad = misses > 5 * np.median(misses) + 1e-6
+        if bad.any() and not bad.all():
+            before, start = self.q_tree, np.where(bad[:, None], find(~bad), self.q_tree)
+            self.q_tree = self._fit_poses(start, self.readings.values, weights)
+            self.q_tree = np.where((self.misses(weights) < misses)[:, None], self.q_tree, before)
+
+    def _nearest(self, met: BoolArray, weights: Array) -> Array:
+        """Return for each pose the configuration of the nearest of some others."""
+        values = np.nan_to_num(self.readings.values) * weights
+        distance = np.linalg.norm(values[:, None] - values[None, met], axis=2)
+        return np.asarray(self.q_tree[np.flatnonzero(met)[distance.argmin(axis=1)]])
 
     def _place_tracker(self) -> None:
         """Set the tracker's frame to the one that fits the points best (Kabsch)."""

@@ -215,6 +215,16 @@ def test_random_mechanism_is_calibrated(seed: int, tmp_path: Path) -> None:
     check_trials(path, poses, truth, 1e-4, 8)
 
 
+def test_poses_are_found_far_from_the_assembled_configuration() -> None:
+    """Two arms that hold a load: their encoders alone, without its free root, tell how they hold it."""
+    truth = {f"loop.left_grip.frame_b.xyz.{axis}": x for axis, x in zip("xyz", (-0.152, 0.001, 0.003), strict=True)}
+    arms = ckc_pin.load("two_ur5", truth)
+    joints = [name for name in arms.coordinates if name not in arms.tree.free_coordinates]
+    poses = measure_mechanism(arms, draw_poses(arms, 12, 0.2), joints)
+    result = calibrate("two_ur5", poses, "loop.left_grip.frame_b.xyz")
+    assert np.abs(errors(result, truth)).max() < 1e-9
+
+
 def read_vector(mechanism: Mechanism, name: str) -> tuple[float, float, float]:
     """Return the value of a vector of the mechanism's file."""
     value = values_of(mechanism.spec, mechanism.urdf)[name]
