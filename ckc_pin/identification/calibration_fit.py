@@ -281,7 +281,7 @@ class Fit:
             self.q_tree = self._follow(self.q_tree, weights)
             self._retry(lambda _: self.close(measured)[0], weights)
             for _ in range(MAX_RETRIES):
-                self._retry(lambda met: self._follow(self._nearest(met, weights), weights), weights)
+                self._retry(lambda good: self._follow(self._nearest(good, weights), weights), weights)
         if self.tracker:
             self._place_tracker()
             self.q_tree = self._fit_poses(self.q_tree, readings.values, self.present / self.unit)
@@ -328,11 +328,11 @@ class Fit:
             self.q_tree = self._fit_poses(start, self.readings.values, weights)
             self.q_tree = np.where((self.misses(weights) < misses)[:, None], self.q_tree, before)
 
-    def _nearest(self, met: BoolArray, weights: Array) -> Array:
+    def _nearest(self, good: BoolArray, weights: Array) -> Array:
         """Return for each pose the configuration of the nearest of some others."""
         values = np.nan_to_num(self.readings.values) * weights
-        distance = np.linalg.norm(values[:, None] - values[None, met], axis=2)
-        return np.asarray(self.q_tree[np.flatnonzero(met)[distance.argmin(axis=1)]])
+        distance = np.linalg.norm(values[:, None] - values[None, good], axis=2)
+        return np.asarray(self.q_tree[np.flatnonzero(good)[distance.argmin(axis=1)]])
 
     def _place_tracker(self) -> None:
         """Set the tracker's frame to the one that fits the points best (Kabsch)."""
