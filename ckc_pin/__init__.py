@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
+    from ckc_pin.identification.calibration import Calibration, calibrate
     from ckc_pin.identification.identify import Identification, identify
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
 __all__ = [
+    "Calibration",
     "Check",
     "CkcError",
     "Controller",
@@ -102,6 +104,7 @@ __all__ = [
     "Terms",
     "Tracking",
     "as_ivp",
+    "calibrate",
     "check",
     "ensemble",
     "explore",
@@ -125,6 +128,7 @@ __version__ = "0.1.0"
 
 
 MODULES = {
+    "Calibration": "identification.calibration",
     "Check": "analysis.check",
     "CkcError": "errors",
     "Controller": "control.controllers",
@@ -154,6 +158,7 @@ MODULES = {
     "Terms": "dynamics.terms",
     "Tracking": "control.controllers",
     "as_ivp": "run.ivp",
+    "calibrate": "identification.calibration",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
     "explore": "explorer.explore",
