@@ -1,0 +1,379 @@
+"""Periodic motions of the independent coordinates, and the search for those that make parameters best known.
+
+The regressor of an instant depends on the motion only through q, q_dot and q_ddot there. Its derivatives by the Fourier
+coefficients follow by the chain rule from 3d differences at each instant, however many coefficients there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, BoolArray, Immutable
+from ckc_pin.errors import InputError
+from ckc_pin.identification.fit import STRUCTURAL_RANK_TOLERANCE
+from ckc_pin.identification.measured_motion import MeasuredMotion, close_many, motion_along
+from ckc_pin.identification.regressor import TorqueRegressor
+from ckc_pin.mechanism.batch import evaluate_closure
+
+__all__ = ["Criterion", "ExcitationProblem", "Instants", "Limits", "fourier"]
+
+Criterion = Literal["condition", "log_det"]
+
+SAMPLES_PER_WAVE = 12  # of the highest harmonic, on the grid that is optimized
+MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism
+RAY = np.linspace(0.0, 1.0, 7)[1:]  # amplitudes at which a random motion is tried
+DIFFERENCE_STEP = 1e-6  # relative to typical sizes
+SLOW = 0.02  # of the typical rate: dry friction is smoothed below it while derivatives are needed
+STAGES = ((4.0, 50.0, 30), (20.0, 200.0, 30))  # sharpness of condition number and of limits, iterations
+REPAIR_ROUNDS, REPAIR_ITERATIONS = 6, 12
+FAILURE = 1e3  # value of a motion that cannot be followed, above the logarithm of any condition number
+
+
+@dataclass(frozen=True, eq=False)
+class Limits(Immutable):
+    """Limits of all quantities of a motion: coordinates, rates, accelerations, shaft speeds, torques, singular values.
+
+    Attributes
+    ----------
+    names : tuple of str
+    lower, upper : (k,) arrays
+        Infinite if there is no limit.
+    scale : (k,) array
+        Size by which a violation is measured.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    scale: Array
+
+    @property
+    def used(self) -> BoolArray:
+        """Whether a quantity has a limit."""
+        return np.isfinite(self.lower) | np.isfinite(self.upper)
+
+    def violation(self, quantities: Array) -> Array:
+        """Return by how much instants (m, k) exceed lower and upper limits, in sizes, shape (2, m, k); negative inside."""
+        return np.array([self.lower - quantities, quantities - self.upper]) / self.scale
+
+    def worst(self, quantities: Array) -> Array:
+        """Return the largest violation of each quantity over all instants, shape (k,)."""
+        return np.asarray(self.violation(quantities).max(axis=(0, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Instants(Immutable):
+    """A motion at m instants with its quantities and its weighted regressor.
+
+    Attributes
+    ----------
+    motion : MeasuredMotion
+    quantities : (m, k) array
+        In the order of the limits.
+    regressor : (m, motors, p) array
+        Columns in typical sizes, rows in standard deviations of the motors' torques.
+    """
+
+    motion: MeasuredMotion
+    quantities: Array
+    regressor: Array
+
+
+def fourier(t: Array, period: float, harmonics: int) -> Array:
+    """Return offset, sines and cosines, their rates and accelerations, shape (3, m, 1 + 2 harmonics)."""
+    w = 2 * np.pi / period * np.arange(1, harmonics + 1)
+    sine, cosine, one = np.sin(np.outer(t, w)), np.cos(np.outer(t, w)), np.ones((len(t), 1))
+    return np.array([np.hstack([one, sine, cosine]), np.hstack([0 * one, w * cosine, -w * sine]),
+                     np.hstack([0 * one, -(w**2) * sine, -(w**2) * cosine])])  # fmt: skip
+
+
+class ExcitationProblem:
+    """The best motion of a period within limits.
+
+    Parameters
+    ----------
+    regressor : TorqueRegressor
+    period : float
+        s.
+    harmonics : int
+    limits : Limits
+    noise : (motors,) array
+        Standard deviations of measured torques.
+    criterion : "condition" or "log_det"
+
+    Attributes
+    ----------
+    basis : (p, r) array
+        Orthonormal directions of the unknowns that some motion determines, in typical sizes.
+    """
+
+    def __init__(
+        self, regressor: TorqueRegressor, period: float, harmonics: int, limits: Limits, noise: Array,
+        criterion: Criterion,
+    ) -> None:  # fmt: skip
+        self.mechanism, self.regressor, self.limits = regressor.mechanism, regressor, limits
+        self.noise, self.criterion = noise, criterion
+        tree, at = self.mechanism.tree, self.mechanism.partition.q
+        self.period, self.harmonics, self.d = period, harmonics, len(at)
+        self.t = np.arange(SAMPLES_PER_WAVE * harmonics) * period / (SAMPLES_PER_WAVE * harmonics)
+        self.waves = fourier(self.t, period, harmonics)
+        self.start = tree.to_coordinates(self.mechanism.assembled.q_tree)[at]
+        self.size = np.array([1.0, 2 * np.pi / period, (2 * np.pi / period) ** 2])[:, None] * tree.step_scale[at]
+        self.lower, self.upper = limits.lower[at], limits.upper[at]
+        order = np.concatenate([[1.0], *2 * [np.arange(1, harmonics + 1)]])
+        self.unit = (self.upper - self.lower)[:, None] / 2 / order  # of a Fourier coefficient
+        self._sign = np.sign(np.linalg.det(self.mechanism.assembled.phi_z)) if self.mechanism.closure.rows else 1.0
+        self.basis = np.eye(len(regressor.unknowns))
+
+    # --- motions at instants ---------------------------------------------------------------------
+
+    def evaluate(self, q_tree: Array, x: Array, waves: Array | None = None) -> Instants | None:
+        """Return a motion with Fourier coefficients x (d, 1 + 2 harmonics), followed from closed configurations.
+
+        The result is None if the loops cannot follow it on their branch.
+        """
+        waves = self.waves if waves is None else waves
+        q, v, a = np.einsum("smc,dc->smd", waves, x)
+        try:
+            return self.instants(self.follow(q_tree, q), q, v, a)
+        except (InputError, np.linalg.LinAlgError):
+            return None
+
+    def follow(self, q_tree: Array, q: Array) -> Array:
+        """Return closed configurations (m, nq) near independent coordinates q, by continuation from others (InputError)."""
+        tree, at = self.mechanism.tree, self.mechanism.partition.q
+        numbers = np.array([tree.to_coordinates(one) for one in q_tree])
+        missing = q - numbers[:, at]
+        count = 1 + int(np.max(np.abs(missing) / tree.step_scale[at]) / MAX_CONTINUATION_STEP)
+        for k in range(1, count):
+            q_tree = close_many(self.mechanism, q_tree, q - missing * (1 - k / count))
+        return q_tree
+
+    def instants(self, q_tree: Array, q: Array, v: Array, a: Array, *, smooth: bool = True) -> Instants:
+        """Return quantities and regressor of instants, each by itself, from closed configurations near q (InputError)."""
+        mechanism, tree, motors = self.mechanism, self.mechanism.tree, self.mechanism.motors
+        motion = motion_along(mechanism, np.zeros(len(q)), q_tree, q, v, a)
+        if smooth:
+            motion = replace(motion, v_std=SLOW * 2 * np.pi / self.period * tree.step_scale)
+        columns, force = self.regressor.rows(motion)
+        to_forces = np.einsum("knd,mn->kdm", motion.rho, motors.transmission)
+        to_motors = np.linalg.pinv(to_forces)
+        numbers = np.array([tree.to_coordinates(one) for one in motion.q_tree])
+        sigma = np.full((len(q), 2), np.inf)
+        if mechanism.closure.rows:
+            _, J = evaluate_closure(tree, mechanism.closure, motion.q_tree)
+            phi_z = J[:, mechanism.independent_rows][:, :, mechanism.partition.z]
+            sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+            if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
+                raise InputError("excite: the motion leaves its branch")
+        sigma[:, 1] = np.linalg.svd(to_forces, compute_uv=False)[:, -1]
+        tau = np.einsum("kmd,kd->km", to_motors, force)
+        shafts = motion.v_tree @ motors.transmission.T
+        quantities = np.hstack([numbers, motion.v_tree, motion.a_tree, shafts, tau, sigma])
+        return Instants(motion, quantities, to_motors @ (columns * self.regressor.scale) / self.noise[:, None])
+
+    # --- criterion -------------------------------------------------------------------------------
+
+    def values(self, regressor: Array) -> tuple[float, float]:
+        """Return condition number and log det of the information in the determined directions, by instant."""
+        s = np.linalg.svd((regressor @ self.basis).reshape(-1, self.basis.shape[1]), compute_uv=False)
+        if s[-1] <= STRUCTURAL_RANK_TOLERANCE * s[0]:
+            return float("inf"), float("-inf")
+        return float(s[0] / s[-1]), float(2 * np.sum(np.log(s / np.sqrt(len(regressor)))))
+
+    def score(self, regressor: Array) -> float:
+        """Return what the search makes small."""
+        condition, log_det = self.values(regressor)
+        return float(np.log(condition)) if self.criterion == "condition" else -log_det
+
+    def objective(self, regressor: Array, sharpness: float) -> tuple[float, Array]:
+        """Return the smoothed criterion, and its derivatives by the regressor in the determined directions."""
+        W = regressor @ self.basis
+        values, vectors = np.linalg.eigh(np.einsum("kmi,kmj->ij", W, W) / len(W))
+        values = np.maximum(values, 1e-30)
+        logs = np.log(values)
+        if self.criterion == "log_det":
+            objective, slopes = -0.5 * float(logs.sum()), -0.5 / values
+        else:
+            (high, up), (low, down) = _soft_max(sharpness * logs), _soft_max(-sharpness * logs)
+            objective, slopes = 0.5 * (high + low) / sharpness, 0.5 * (up - down) / values
+        return objective, 2 / len(W) * W @ ((vectors * slopes) @ vectors.T)
+
+    def differences(self, instants: Instants, x: Array) -> tuple[Array, Array]:
+        """Return derivatives of quantities (3, d, m, k) and of the regressor (3, d, m, motors, r) by q, q_dot and q_ddot."""
+        d, m = self.d, len(self.t)
+        steps = DIFFERENCE_STEP * self.size.ravel()
+        moved = np.tile(np.einsum("smc,dc->smd", self.waves, x)[:, None], (1, 3 * d, 1, 1))
+        for k, step in enumerate(steps):
+            moved[k // d, k, :, k % d] += step
+        q_tree = np.tile(instants.motion.q_tree, (3 * d, 1))
+        there = self.instants(q_tree, *moved.reshape(3, -1, d))
+        by_quantity = there.quantities.reshape(3 * d, m, -1) - instants.quantities
+        by_regressor = (there.regressor.reshape(3 * d, *instants.regressor.shape) - instants.regressor) @ self.basis
+        return (
+            (by_quantity / steps[:, None, None]).reshape(3, d, *instants.quantities.shape),
+            (by_regressor / steps[:, None, None, None]).reshape(3, d, m, -1, self.basis.shape[1]),
+        )
+
+    # --- search ----------------------------------------------------------------------------------
+
+    def random_motion(self, rng: np.random.Generator) -> tuple[Array, list[Instants], Array]:
+        """Return a random motion with the largest amplitude within the limits: coefficients, and instants if there is one.
+
+        The last value is the violation of each limit, at the amplitude where the largest is smallest.
+        """
+        half = (self.upper - self.lower) / 2
+        offset = self.lower + half * rng.uniform(0.4, 1.6, self.d)
+        x = np.hstack([offset[:, None], rng.normal(size=(self.d, 2 * self.harmonics)) * self.unit[:, 1:]])
+        reach = np.abs(np.einsum("mc,dc->md", self.waves[0, :, 1:], x[:, 1:])).max(axis=0)
+        x[:, 1:] *= (np.minimum(offset - self.lower, self.upper - offset) / reach)[:, None]
+        centre = np.zeros_like(x)
+        centre[:, 0] = self.start
+        q_tree = np.repeat(self.mechanism.assembled.q_tree[None], len(self.t), axis=0)
+        best, least = (x, list[Instants]()), np.full(len(self.limits.names), np.inf)
+        for amplitude in RAY:
+            scaled = centre + amplitude * (x - centre)
+            instants = self.evaluate(q_tree, scaled)
+            if instants is None:
+                break
+            q_tree = instants.motion.q_tree
+            worst = self.limits.worst(instants.quantities)
+            if worst.max() <= 0:
+                best = scaled, [instants]
+            if worst.max() < least.max():
+                least = worst
+        return best[0], best[1], least
+
+    def set_basis(self, regressors: list[Array]) -> None:
+        """Take the directions of the unknowns that these motions together determine."""
+        p = len(self.regressor.unknowns)
+        _, s, v = np.linalg.svd(np.concatenate([W.reshape(-1, p) for W in regressors]), full_matrices=False)
+        self.basis = v[: int(np.sum(s > STRUCTURAL_RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)))].T
+
+    def optimize(self, x: Array, instants: Instants, progress: Callable[[], None]) -> Array:
+        """Return coefficients whose motion is better than that of x, within the limits on a grid that is five times finer.
+
+        Raises
+        ------
+        InputError
+            No such motion was found.
+        """
+        search = _Search(self, instants.motion.q_tree)
+        for sharpness, hardness, iterations in STAGES:
+            x = search.run(x, sharpness, hardness, iterations, progress=progress)
+        tightening = np.zeros(len(self.limits.names))
+        for _ in range(REPAIR_ROUNDS):
+            fine = self.fine(x, search.q_tree)
+            worst = np.full(len(self.limits.names), np.inf) if fine is None else self.limits.worst(fine.quantities)
+            if worst.max() <= 0:
+                return x
+            tightening = tightening + np.where(worst > 0, 1.5 * worst + 1e-4, 0.0)
+            x = search.run(x, *STAGES[-1][:2], REPAIR_ITERATIONS, tightening)
+        names = ", ".join(name for name, over in zip(self.limits.names, worst, strict=True) if over > 0)
+        raise InputError(f"excite: {names}: no motion stays within this limit between the instants; widen it")
+
+    def fine(self, x: Array, q_tree: Array, refinement: int = 5) -> Instants | None:
+        """Return the motion on a finer grid, without smoothing of friction; None if it cannot be followed."""
+        waves = fourier(np.arange(refinement * len(self.t)) * self.period / (refinement * len(self.t)),
+                        self.period, self.harmonics)  # fmt: skip
+        q, v, a = np.einsum("smc,dc->smd", waves, x)
+        try:
+            return self.instants(self.follow(np.repeat(q_tree, refinement, axis=0), q), q, v, a, smooth=False)
+        except (InputError, np.linalg.LinAlgError):
+            return None
+
+
+class _Search:
+    """Sequential quadratic programming from one motion, with evaluations that start at the last accepted one.
+
+    Each limit is one constraint: a smooth upper bound of its largest violation over the instants (Kreisselmeier and
+    Steinhauser).
+    """
+
+    def __init__(self, problem: ExcitationProblem, q_tree: Array) -> None:
+        self.problem, self.q_tree = problem, q_tree
+        limits = problem.limits
+        self.sides = np.array([np.isfinite(limits.lower), np.isfinite(limits.upper)])
+
+    def run(
+        self, x: Array, sharpness: float, hardness: float, iterations: int, tightening: Array | float = 0.0,
+        progress: Callable[[], None] = lambda: None,
+    ) -> Array:  # fmt: skip
+        """Return the best coefficients that were met from x on, those within the limits first.
+
+        Parameters
+        ----------
+        sharpness : float
+            Of the smoothed condition number.
+        hardness : float
+            Of the bound of violations.
+        tightening : (k,) array or 0
+            Sizes by which limits are narrowed.
+        """
+        from scipy.optimize import minimize
+
+        problem, unit = self.problem, self.problem.unit
+        visited: dict[bytes, tuple[Instants | None, Array]] = {}
+        best: list[tuple[float, float, Array]] = []
+
+        def violation(instants: Instants) -> Array:
+            """Return the violations of used limits, shape (m, sides)."""
+            exceeded = problem.limits.violation(instants.quantities) + tightening
+            return np.concatenate([side[:, used] for side, used in zip(exceeded, self.sides, strict=True)], axis=1)
+
+        def visit(y: Array) -> tuple[Instants | None, Array]:
+            if y.tobytes() not in visited:
+                instants = problem.evaluate(self.q_tree, y.reshape(unit.shape) * unit)
+                exceeded = np.ones((1, int(self.sides.sum()))) if instants is None else violation(instants)
+                visited.clear()
+                visited[y.tobytes()] = instants, exceeded
+                if instants is not None:
+                    best.append((max(float(exceeded.max(initial=0.0)), 0.0), problem.score(instants.regressor), y.copy()))
+                    best[:] = [min(best, key=lambda entry: entry[:2])]
+            return visited[y.tobytes()]
+
+        def objective(y: Array) -> float:
+            instants, _ = visit(y)
+            return FAILURE if instants is None else problem.objective(instants.regressor, sharpness)[0]
+
+        def constraint(y: Array) -> Array:
+            return -_soft_max(hardness * visit(y)[1])[0] / hardness
+
+        slopes: dict[bytes, tuple[Array, Array]] = {}
+
+        def derivatives(y: Array) -> tuple[Array, Array]:
+            if y.tobytes() not in slopes:
+                instants, exceeded = visit(y)
+                assert instants is not None  # a step to a motion that cannot be followed is not accepted
+                self.q_tree = instants.motion.q_tree
+                by_quantity, by_regressor = problem.differences(instants, y.reshape(unit.shape) * unit)
+                lower, upper = self.sides
+                by_side = np.concatenate([-by_quantity[..., lower] / problem.limits.scale[lower],
+                                          by_quantity[..., upper] / problem.limits.scale[upper]], axis=-1)  # fmt: skip
+                _, weights = _soft_max(hardness * exceeded)
+                _, gradient = problem.objective(instants.regressor, sharpness)
+                local = np.concatenate([np.einsum("kmr,sdkmr->sdk", gradient, by_regressor)[..., None],
+                                        by_side * weights], axis=-1)  # fmt: skip
+                total = np.einsum("sdkg,skc,dc->gdc", local, problem.waves, unit).reshape(local.shape[-1], -1)
+                slopes.clear()
+                slopes[y.tobytes()] = total[0], -total[1:]
+            return slopes[y.tobytes()]
+
+        minimize(
+            objective, (x / unit).ravel(), jac=lambda y: derivatives(y)[0], method="SLSQP",
+            constraints={"type": "ineq", "fun": constraint, "jac": lambda y: derivatives(y)[1]},
+            options={"maxiter": iterations, "ftol": 1e-5}, callback=lambda _: progress(),
+        )  # fmt: skip
+        return best[0][2].reshape(unit.shape) * unit
+
+
+def _soft_max(values: Array) -> tuple[Any, Array]:
+    """Return the logarithm of the sum of exponentials along the first axis, and its derivatives."""
+    top = values.max(axis=0)
+    weights = np.exp(values - top)
+    total = weights.sum(axis=0)
+    return top + np.log(total), weights / total
