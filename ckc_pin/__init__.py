@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
+    from ckc_pin.identification.excitation import Excitation, excite
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
     from ckc_pin.kinematics.point import Point
@@ -76,6 +77,7 @@ __all__ = [
     "CkcError",
     "Controller",
     "Event",
+    "Excitation",
     "Explorer",
     "Floquet",
     "Force",
@@ -102,6 +104,7 @@ __all__ = [
     "as_ivp",
     "check",
     "ensemble",
+    "excite",
     "explore",
     "floquet",
     "gain_locus",
@@ -126,6 +129,7 @@ MODULES = {
     "CkcError": "errors",
     "Controller": "control.controllers",
     "Event": "run.events",
+    "Excitation": "identification.excitation",
     "Explorer": "explorer.explore",
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
@@ -152,6 +156,7 @@ MODULES = {
     "as_ivp": "run.ivp",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
+    "excite": "identification.excitation",
     "explore": "explorer.explore",
     "floquet": "sensitivity.floquet",
     "gain_locus": "linear.locus",

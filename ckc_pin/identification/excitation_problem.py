@@ -25,11 +25,11 @@ Criterion = Literal["condition", "log_det"]
 
 SAMPLES_PER_WAVE = 12  # of the highest harmonic, on the grid that is optimized
 MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism
-RAY = np.linspace(0.0, 1.0, 7)[1:]  # amplitudes at which a random motion is tried
+BISECTIONS = 7  # of the amplitude of a random motion
 DIFFERENCE_STEP = 1e-6  # relative to typical sizes
 SLOW = 0.02  # of the typical rate: dry friction is smoothed below it while derivatives are needed
-STAGES = ((4.0, 50.0, 30), (20.0, 200.0, 30))  # sharpness of condition number and of limits, iterations
-REPAIR_ROUNDS, REPAIR_ITERATIONS = 6, 12
+STAGES = ((4.0, 50.0), *6 * [(20.0, 200.0)])  # sharpness of condition number and of limits; the last ones narrow limits
+VIOLATION_PRICE = 100.0  # in the criterion, of a violation by one size
 FAILURE = 1e3  # value of a motion that cannot be followed, above the logarithm of any condition number
 
 
@@ -126,12 +126,14 @@ class ExcitationProblem:
         self.lower, self.upper = limits.lower[at], limits.upper[at]
         order = np.concatenate([[1.0], *2 * [np.arange(1, harmonics + 1)]])
         self.unit = (self.upper - self.lower)[:, None] / 2 / order  # of a Fourier coefficient
-        self._sign = np.sign(np.linalg.det(self.mechanism.assembled.phi_z)) if self.mechanism.closure.rows else 1.0
+        self._sign = np.sign(np.linalg.det(self._phi_z(self.mechanism.assembled.q_tree[None])))
         self.basis = np.eye(len(regressor.unknowns))
 
     # --- motions at instants ---------------------------------------------------------------------
 
-    def evaluate(self, q_tree: Array, x: Array, waves: Array | None = None) -> Instants | None:
+    def evaluate(
+        self, q_tree: Array, x: Array, waves: Array | None = None, *, smooth: bool = True
+    ) -> Instants | None:
         """Return a motion with Fourier coefficients x (d, 1 + 2 harmonics), followed from closed configurations.
 
         The result is None if the loops cannot follow it on their branch.
@@ -139,7 +141,7 @@ class ExcitationProblem:
         waves = self.waves if waves is None else waves
         q, v, a = np.einsum("smc,dc->smd", waves, x)
         try:
-            return self.instants(self.follow(q_tree, q), q, v, a)
+            return self.instants(self.follow(q_tree, q), q, v, a, smooth=smooth)
         except (InputError, np.linalg.LinAlgError):
             return None
 
@@ -163,18 +165,22 @@ class ExcitationProblem:
         to_forces = np.einsum("knd,mn->kdm", motion.rho, motors.transmission)
         to_motors = np.linalg.pinv(to_forces)
         numbers = np.array([tree.to_coordinates(one) for one in motion.q_tree])
-        sigma = np.full((len(q), 2), np.inf)
-        if mechanism.closure.rows:
-            _, J = evaluate_closure(tree, mechanism.closure, motion.q_tree)
-            phi_z = J[:, mechanism.independent_rows][:, :, mechanism.partition.z]
+        sigma, phi_z = np.full((len(q), 2), np.inf), self._phi_z(motion.q_tree)
+        if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
+            raise InputError("excite: the motion leaves its branch")
+        if phi_z.shape[1]:
             sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
-            if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
-                raise InputError("excite: the motion leaves its branch")
         sigma[:, 1] = np.linalg.svd(to_forces, compute_uv=False)[:, -1]
         tau = np.einsum("kmd,kd->km", to_motors, force)
         shafts = motion.v_tree @ motors.transmission.T
         quantities = np.hstack([numbers, motion.v_tree, motion.a_tree, shafts, tau, sigma])
         return Instants(motion, quantities, to_motors @ (columns * self.regressor.scale) / self.noise[:, None])
+
+    def _phi_z(self, q_tree: Array) -> Array:
+        """Return phi_z (m, rows, rows) without redundant rows."""
+        mechanism = self.mechanism
+        _, J = evaluate_closure(mechanism.tree, mechanism.closure, q_tree)
+        return J[:, mechanism.independent_rows][:, :, mechanism.partition.z]
 
     # --- criterion -------------------------------------------------------------------------------
 
@@ -221,10 +227,10 @@ class ExcitationProblem:
 
     # --- search ----------------------------------------------------------------------------------
 
-    def random_motion(self, rng: np.random.Generator) -> tuple[Array, list[Instants], Array]:
-        """Return a random motion with the largest amplitude within the limits: coefficients, and instants if there is one.
+    def random_motion(self, rng: np.random.Generator) -> tuple[list[tuple[Array, Instants]], Array]:
+        """Return a random motion with the largest amplitude within the limits, as a list that is empty if there is none.
 
-        The last value is the violation of each limit, at the amplitude where the largest is smallest.
+        Beside it, the violation of each limit at the amplitude where the largest is smallest.
         """
         half = (self.upper - self.lower) / 2
         offset = self.lower + half * rng.uniform(0.4, 1.6, self.d)
@@ -234,19 +240,21 @@ class ExcitationProblem:
         centre = np.zeros_like(x)
         centre[:, 0] = self.start
         q_tree = np.repeat(self.mechanism.assembled.q_tree[None], len(self.t), axis=0)
-        best, least = (x, list[Instants]()), np.full(len(self.limits.names), np.inf)
-        for amplitude in RAY:
+        best, least = list[tuple[Array, Instants]](), np.full(len(self.limits.names), np.inf)
+        amplitude, low, high = 1.0, 0.0, 1.0
+        for _ in range(BISECTIONS):
             scaled = centre + amplitude * (x - centre)
             instants = self.evaluate(q_tree, scaled)
-            if instants is None:
+            worst = np.full(len(least), np.inf) if instants is None else self.limits.worst(instants.quantities)
+            least = worst if worst.max() < least.max() else least
+            if instants is not None and worst.max() <= 0:
+                best, low, q_tree = [(scaled, instants)], amplitude, instants.motion.q_tree
+            else:
+                high = amplitude
+            if low == 1.0:
                 break
-            q_tree = instants.motion.q_tree
-            worst = self.limits.worst(instants.quantities)
-            if worst.max() <= 0:
-                best = scaled, [instants]
-            if worst.max() < least.max():
-                least = worst
-        return best[0], best[1], least
+            amplitude = (low + high) / 2
+        return best, least
 
     def set_basis(self, regressors: list[Array]) -> None:
         """Take the directions of the unknowns that these motions together determine."""
@@ -254,8 +262,10 @@ class ExcitationProblem:
         _, s, v = np.linalg.svd(np.concatenate([W.reshape(-1, p) for W in regressors]), full_matrices=False)
         self.basis = v[: int(np.sum(s > STRUCTURAL_RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)))].T
 
-    def optimize(self, x: Array, instants: Instants, progress: Callable[[], None]) -> Array:
-        """Return coefficients whose motion is better than that of x, within the limits on a grid that is five times finer.
+    def optimize(
+        self, x: Array, instants: Instants, iterations: int, progress: Callable[[], None]
+    ) -> tuple[Array, Instants]:
+        """Return a better motion than that of x, within the limits on a grid that is five times finer, and its instants.
 
         Raises
         ------
@@ -263,28 +273,22 @@ class ExcitationProblem:
             No such motion was found.
         """
         search = _Search(self, instants.motion.q_tree)
-        for sharpness, hardness, iterations in STAGES:
-            x = search.run(x, sharpness, hardness, iterations, progress=progress)
         tightening = np.zeros(len(self.limits.names))
-        for _ in range(REPAIR_ROUNDS):
+        for k, (sharpness, hardness) in enumerate(STAGES):
+            x = search.run(x, sharpness, hardness, iterations if k < 2 else 1 + iterations // 2, tightening, progress)
             fine = self.fine(x, search.q_tree)
             worst = np.full(len(self.limits.names), np.inf) if fine is None else self.limits.worst(fine.quantities)
-            if worst.max() <= 0:
-                return x
-            tightening = tightening + np.where(worst > 0, 1.5 * worst + 1e-4, 0.0)
-            x = search.run(x, *STAGES[-1][:2], REPAIR_ITERATIONS, tightening)
+            if fine is not None and k > 0 and worst.max() <= 0:
+                return x, fine
+            tightening = tightening + np.where(worst > 0, 1.5 * np.minimum(worst, 0.1) + 1e-4, 0.0)
         names = ", ".join(name for name, over in zip(self.limits.names, worst, strict=True) if over > 0)
         raise InputError(f"excite: {names}: no motion stays within this limit between the instants; widen it")
 
     def fine(self, x: Array, q_tree: Array, refinement: int = 5) -> Instants | None:
         """Return the motion on a finer grid, without smoothing of friction; None if it cannot be followed."""
-        waves = fourier(np.arange(refinement * len(self.t)) * self.period / (refinement * len(self.t)),
-                        self.period, self.harmonics)  # fmt: skip
-        q, v, a = np.einsum("smc,dc->smd", waves, x)
-        try:
-            return self.instants(self.follow(np.repeat(q_tree, refinement, axis=0), q), q, v, a, smooth=False)
-        except (InputError, np.linalg.LinAlgError):
-            return None
+        count = refinement * len(self.t)
+        waves = fourier(np.arange(count) * self.period / count, self.period, self.harmonics)
+        return self.evaluate(np.repeat(q_tree, refinement, axis=0), x, waves, smooth=False)
 
 
 class _Search:
@@ -300,10 +304,10 @@ class _Search:
         self.sides = np.array([np.isfinite(limits.lower), np.isfinite(limits.upper)])
 
     def run(
-        self, x: Array, sharpness: float, hardness: float, iterations: int, tightening: Array | float = 0.0,
-        progress: Callable[[], None] = lambda: None,
+        self, x: Array, sharpness: float, hardness: float, iterations: int, tightening: Array,
+        progress: Callable[[], None],
     ) -> Array:  # fmt: skip
-        """Return the best coefficients that were met from x on, those within the limits first.
+        """Return the best coefficients that were met from x on, with a price for violated limits.
 
         Parameters
         ----------
@@ -311,14 +315,14 @@ class _Search:
             Of the smoothed condition number.
         hardness : float
             Of the bound of violations.
-        tightening : (k,) array or 0
+        tightening : (k,) array
             Sizes by which limits are narrowed.
         """
         from scipy.optimize import minimize
 
         problem, unit = self.problem, self.problem.unit
         visited: dict[bytes, tuple[Instants | None, Array]] = {}
-        best: list[tuple[float, float, Array]] = []
+        best: list[tuple[float, Array]] = []
 
         def violation(instants: Instants) -> Array:
             """Return the violations of used limits, shape (m, sides)."""
@@ -332,8 +336,9 @@ class _Search:
                 visited.clear()
                 visited[y.tobytes()] = instants, exceeded
                 if instants is not None:
-                    best.append((max(float(exceeded.max(initial=0.0)), 0.0), problem.score(instants.regressor), y.copy()))
-                    best[:] = [min(best, key=lambda entry: entry[:2])]
+                    price = VIOLATION_PRICE * max(float(exceeded.max(initial=0.0)), 0.0)
+                    best.append((problem.score(instants.regressor) + price, y.copy()))
+                    best[:] = [min(best, key=lambda entry: entry[0])]
             return visited[y.tobytes()]
 
         def objective(y: Array) -> float:
@@ -368,7 +373,7 @@ class _Search:
             constraints={"type": "ineq", "fun": constraint, "jac": lambda y: derivatives(y)[1]},
             options={"maxiter": iterations, "ftol": 1e-5}, callback=lambda _: progress(),
         )  # fmt: skip
-        return best[0][2].reshape(unit.shape) * unit
+        return best[0][1].reshape(unit.shape) * unit
 
 
 def _soft_max(values: Array) -> tuple[Any, Array]:
