@@ -247,13 +247,13 @@ def play(
 
 
 def plot(
-    *shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | xarray.Dataset,
+    *shown: Run | LinearModel | GainLocus | Sensitivities | MotionForces | Excitation | SingularityMap | xarray.Dataset,
 ) -> Figures:
     """Draw figures of runs, or of another result: a linear model, a root locus, sensitivities, a map, an ensemble.
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap or xarray.Dataset
+    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap or xarray.Dataset
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
         The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
         map over two.

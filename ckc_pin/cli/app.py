@@ -49,6 +49,7 @@ COMMANDS = {
     "inverse": "analyses:inverse",
     "linearize": "analyses:linearize",
     "sensitivities": "analyses:sensitivities",
+    "excite": "excite:excite",
     "sweep": "sweep:sweep",
     "plot": "runs:plot",
     "play": "runs:play",

@@ -23,12 +23,13 @@ __all__ = ["Criterion", "ExcitationProblem", "Instants", "Limits", "fourier"]
 
 Criterion = Literal["condition", "log_det"]
 
-SAMPLES_PER_WAVE = 12  # of the highest harmonic, on the grid that is optimized
+SAMPLES_PER_WAVE = 16  # of the highest harmonic, on the grid that is optimized
 MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism
 BISECTIONS = 7  # of the amplitude of a random motion
 DIFFERENCE_STEP = 1e-6  # relative to typical sizes
 SLOW = 0.02  # of the typical rate: dry friction is smoothed below it while derivatives are needed
 STAGES = ((4.0, 50.0), *6 * [(20.0, 200.0)])  # sharpness of condition number and of limits; the last ones narrow limits
+REPAIR_STEP = 1e-3  # sizes by which limits are narrowed in addition to a violation, at the first repair
 VIOLATION_PRICE = 100.0  # in the criterion, of a violation by one size
 FAILURE = 1e3  # value of a motion that cannot be followed, above the logarithm of any condition number
 
@@ -157,24 +158,30 @@ class ExcitationProblem:
 
     def instants(self, q_tree: Array, q: Array, v: Array, a: Array, *, smooth: bool = True) -> Instants:
         """Return quantities and regressor of instants, each by itself, from closed configurations near q (InputError)."""
-        mechanism, tree, motors = self.mechanism, self.mechanism.tree, self.mechanism.motors
-        motion = motion_along(mechanism, np.zeros(len(q)), q_tree, q, v, a)
+        motion = motion_along(self.mechanism, np.zeros(len(q)), q_tree, q, v, a)
+        return self._measure(motion, self._singular_values(motion), smooth=smooth)
+
+    def _measure(self, motion: MeasuredMotion, sigma: Array, *, smooth: bool = True) -> Instants:
+        tree, motors = self.mechanism.tree, self.mechanism.motors
         if smooth:
             motion = replace(motion, v_std=SLOW * 2 * np.pi / self.period * tree.step_scale)
         columns, force = self.regressor.rows(motion)
-        to_forces = np.einsum("knd,mn->kdm", motion.rho, motors.transmission)
-        to_motors = np.linalg.pinv(to_forces)
+        to_motors = np.linalg.pinv(np.einsum("knd,mn->kdm", motion.rho, motors.transmission))
         numbers = np.array([tree.to_coordinates(one) for one in motion.q_tree])
-        sigma, phi_z = np.full((len(q), 2), np.inf), self._phi_z(motion.q_tree)
-        if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
-            raise InputError("excite: the motion leaves its branch")
-        if phi_z.shape[1]:
-            sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
-        sigma[:, 1] = np.linalg.svd(to_forces, compute_uv=False)[:, -1]
         tau = np.einsum("kmd,kd->km", to_motors, force)
         shafts = motion.v_tree @ motors.transmission.T
         quantities = np.hstack([numbers, motion.v_tree, motion.a_tree, shafts, tau, sigma])
         return Instants(motion, quantities, to_motors @ (columns * self.regressor.scale) / self.noise[:, None])
+
+    def _singular_values(self, motion: MeasuredMotion) -> Array:
+        """Return the least singular values of phi_z and of the motors' motions, shape (m, 2) (InputError)."""
+        sigma, phi_z = np.full((len(motion.q_tree), 2), np.inf), self._phi_z(motion.q_tree)
+        if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
+            raise InputError("excite: the motion leaves its branch")
+        if phi_z.shape[1]:
+            sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+        sigma[:, 1] = np.linalg.svd(self.mechanism.motors.transmission @ motion.rho, compute_uv=False)[:, -1]
+        return sigma
 
     def _phi_z(self, q_tree: Array) -> Array:
         """Return phi_z (m, rows, rows) without redundant rows."""
@@ -211,18 +218,32 @@ class ExcitationProblem:
 
     def differences(self, instants: Instants, x: Array) -> tuple[Array, Array]:
         """Return derivatives of quantities (3, d, m, k) and of the regressor (3, d, m, motors, r) by q, q_dot and q_ddot."""
-        d, m = self.d, len(self.t)
-        steps = DIFFERENCE_STEP * self.size.ravel()
-        moved = np.tile(np.einsum("smc,dc->smd", self.waves, x)[:, None], (1, 3 * d, 1, 1))
-        for k, step in enumerate(steps):
-            moved[k // d, k, :, k % d] += step
-        q_tree = np.tile(instants.motion.q_tree, (3 * d, 1))
-        there = self.instants(q_tree, *moved.reshape(3, -1, d))
+        base, d, m = instants.motion, self.d, len(self.t)
+        q, v, a = np.einsum("smc,dc->smd", self.waves, x)
+        h_q, h_v, h_a = steps = DIFFERENCE_STEP * self.size
+        moved = np.repeat(q[None], d, axis=0) + np.einsum("d,de->de", h_q, np.eye(d))[:, None]
+        by_q = motion_along(
+            self.mechanism, np.zeros(d * m), np.tile(base.q_tree, (d, 1)), moved.reshape(-1, d), np.tile(v, (d, 1)),
+            np.tile(a, (d, 1)),
+        )  # fmt: skip
+        # The rate of rho is the sum of q_dot_i d rho/dq_i, so that differences by q give those of a_tree by q_dot too.
+        rho_slopes = (by_q.rho.reshape(d, m, -1, d) - base.rho) / h_q[:, None, None, None]
+        curvature = np.einsum("jmni,mi->jmn", rho_slopes, v) + np.einsum("imnj,mi->jmn", rho_slopes, v)
+        along = base.rho.transpose(2, 0, 1)
+        v_tree = [by_q.v_tree, *(base.v_tree + h_v[:, None, None] * along), *d * [base.v_tree]]
+        a_tree = [by_q.a_tree, *(base.a_tree + h_v[:, None, None] * curvature), *(base.a_tree + h_a[:, None, None] * along)]
+        there = self._measure(
+            MeasuredMotion(
+                np.zeros(3 * d * m), np.vstack([by_q.q_tree, *2 * d * [base.q_tree]]), np.vstack(v_tree), np.vstack(a_tree),
+                np.concatenate([by_q.rho, *2 * d * [base.rho]]), base.v_std,
+            ),
+            np.vstack([self._singular_values(by_q), *2 * d * [instants.quantities[:, -2:]]]),
+        )  # fmt: skip
         by_quantity = there.quantities.reshape(3 * d, m, -1) - instants.quantities
         by_regressor = (there.regressor.reshape(3 * d, *instants.regressor.shape) - instants.regressor) @ self.basis
         return (
-            (by_quantity / steps[:, None, None]).reshape(3, d, *instants.quantities.shape),
-            (by_regressor / steps[:, None, None, None]).reshape(3, d, m, -1, self.basis.shape[1]),
+            (by_quantity / steps.reshape(-1, 1, 1)).reshape(3, d, *instants.quantities.shape),
+            (by_regressor / steps.reshape(-1, 1, 1, 1)).reshape(3, d, m, -1, self.basis.shape[1]),
         )
 
     # --- search ----------------------------------------------------------------------------------
@@ -280,7 +301,7 @@ class ExcitationProblem:
             worst = np.full(len(self.limits.names), np.inf) if fine is None else self.limits.worst(fine.quantities)
             if fine is not None and k > 0 and worst.max() <= 0:
                 return x, fine
-            tightening = tightening + np.where(worst > 0, 1.5 * np.minimum(worst, 0.1) + 1e-4, 0.0)
+            tightening = tightening + np.where(worst > 0, 1.5 * np.minimum(worst, 0.1) + k * REPAIR_STEP, 0.0)
         names = ", ".join(name for name, over in zip(self.limits.names, worst, strict=True) if over > 0)
         raise InputError(f"excite: {names}: no motion stays within this limit between the instants; widen it")
 
