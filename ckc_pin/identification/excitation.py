@@ -170,7 +170,9 @@ class Excitation(HasSummary):
         """Return the instants of run-in and one period at a rate, 1/s (InputError)."""
         duration = self.run_in + self.period
         if not (is_number(rate) and 0 < rate * duration < MAX_SAMPLES):
-            raise InputError(f"excite: rate: expected a number above 0 and below {MAX_SAMPLES / duration:g} 1/s, got {rate}")
+            raise InputError(
+                f"excite: rate: expected a number above 0 and below {MAX_SAMPLES / duration:g} 1/s, got {rate}"
+            )
         return np.arange(int(duration * rate * (1 + 1e-12)) + 1) / rate
 
     def to_csv(self, path: str | Path, rate: float = 100.0) -> Path:
@@ -345,11 +347,15 @@ def _search(
         progress(k + 1, total)
     if not feasible:
         exceeded = [f"{name} by {100 * x:.3g} %" for name, x in zip(limits.names, least, strict=True) if x > 0]
-        which = f"the closest one exceeds {', '.join(exceeded)} of its limit" if np.isfinite(least.max()) else "none closes"
+        which = (
+            f"the closest one exceeds {', '.join(exceeded)} of its limit" if np.isfinite(least.max()) else "none closes"
+        )
         raise InputError(f"excite: limits: none of {count} random motions is within them; {which}")
     problem.set_basis([instants.regressor for _, instants in feasible[:MAX_BASIS_MOTIONS]])
     if not problem.basis.shape[1]:
-        raise InputError(f"excite: parameters: nothing to identify; no motion shows {', '.join(parameters)} in the torques")
+        raise InputError(
+            f"excite: parameters: nothing to identify; no motion shows {', '.join(parameters)} in the torques"
+        )
     values = np.array([problem.values(instants.regressor) for _, instants in feasible])
     x, start = feasible[int(np.argmin([problem.score(instants.regressor) for _, instants in feasible]))]
     done = iter(range(count, 10**9))
@@ -419,15 +425,15 @@ def _noise(mechanism: Mechanism, noise: Mapping[str, float]) -> Array:
     unknown = next((name for name in noise if name not in names), None)
     if unknown is not None:
         raise InputError(f"excite: noise: no quantity {unknown!r}; expected {', '.join(names)}")
-    wrong = next((name for name in names if noise and not (is_number(noise.get(name)) and 0 < noise[name] < np.inf)), None)
+    wrong = next(
+        (name for name in names if noise and not (is_number(noise.get(name)) and 0 < noise[name] < np.inf)), None
+    )
     if wrong is not None:
         raise InputError(f"excite: noise: {wrong}: expected a number above zero, got {noise.get(wrong)!r:.40}")
     return np.array([float(noise.get(name, 1.0)) for name in names])
 
 
-def _make_limits(
-    mechanism: Mechanism, given: Mapping[str, float | Sequence[float]], margin: float
-) -> Limits:
+def _make_limits(mechanism: Mechanism, given: Mapping[str, float | Sequence[float]], margin: float) -> Limits:
     """Return the limits of all quantities: those of joints and motors, given ones, and default ranges (InputError)."""
     coordinates, motors, tree = mechanism.coordinates, mechanism.motors, mechanism.tree
     names = (*coordinates, *(f"v.{x}" for x in coordinates), *(f"a.{x}" for x in coordinates),
@@ -437,7 +443,6 @@ def _make_limits(
     low, high = tree.limits()
     lower = np.concatenate([low, -free, -motors.speed_limit, motors.torque_limit[0], margin * singular])
     upper = np.concatenate([high, free, motors.speed_limit, motors.torque_limit[1], [np.inf, np.inf]])
-    lower[-2:][~np.isfinite(singular)] = -np.inf
     choices = names[:-2]
     for pattern, limit in given.items():
         where = f"excite: limits: {pattern}"
@@ -463,16 +468,16 @@ def _make_limits(
     both = np.isfinite(lower) & np.isfinite(upper)
     one = np.where(np.isfinite(upper), np.abs(upper), np.where(np.isfinite(lower), np.abs(lower), 1.0))
     scale = np.maximum(np.where(both, (np.where(both, upper, 1.0) - np.where(both, lower, 0.0)) / 2, one), 1e-12)
-    scale[-2:] = np.where(np.isfinite(singular), singular, 1.0)
+    scale[-2:] = singular
     return Limits(names, lower, upper, scale)
 
 
 def _singular_values(mechanism: Mechanism) -> Array:
-    """Return the least singular values of phi_z, infinite without loops, and of the motors' motions, as assembled."""
+    """Return the least singular values of phi_z, 1 without loops, and of the motors' motions, as assembled."""
     at = mechanism.assembled
     of_motors = np.linalg.svd(mechanism.motors.transmission @ at.rho, compute_uv=False)[mechanism.d - 1]
     phi_z = at.J[mechanism.independent_rows][:, mechanism.partition.z]
-    return np.array([np.linalg.svd(phi_z, compute_uv=False)[-1] if len(phi_z) else np.inf, of_motors])
+    return np.array([np.linalg.svd(phi_z, compute_uv=False)[-1] if len(phi_z) else 1.0, of_motors])
 
 
 def _units(mechanism: Mechanism) -> dict[str, str]:

@@ -7,6 +7,7 @@ coefficients follow by the chain rule from 3d differences at each instant, howev
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -30,6 +31,8 @@ DIFFERENCE_STEP = 1e-6  # relative to typical sizes
 SLOW = 0.02  # of the typical rate: dry friction is smoothed below it while derivatives are needed
 STAGES = ((4.0, 50.0), *6 * [(20.0, 200.0)])  # sharpness of condition number and of limits; the last ones narrow limits
 REPAIR_STEP = 1e-3  # sizes by which limits are narrowed in addition to a violation, at the first repair
+MAX_REPAIR = 0.1  # sizes by which limits are narrowed at once
+OBJECTIVE_SCALE = 0.1  # so that the first steps, along the gradient, are short
 VIOLATION_PRICE = 100.0  # in the criterion, of a violation by one size
 FAILURE = 1e3  # value of a motion that cannot be followed, above the logarithm of any condition number
 
@@ -132,9 +135,7 @@ class ExcitationProblem:
 
     # --- motions at instants ---------------------------------------------------------------------
 
-    def evaluate(
-        self, q_tree: Array, x: Array, waves: Array | None = None, *, smooth: bool = True
-    ) -> Instants | None:
+    def evaluate(self, q_tree: Array, x: Array, waves: Array | None = None, *, smooth: bool = True) -> Instants | None:
         """Return a motion with Fourier coefficients x (d, 1 + 2 harmonics), followed from closed configurations.
 
         The result is None if the loops cannot follow it on their branch.
@@ -174,8 +175,8 @@ class ExcitationProblem:
         return Instants(motion, quantities, to_motors @ (columns * self.regressor.scale) / self.noise[:, None])
 
     def _singular_values(self, motion: MeasuredMotion) -> Array:
-        """Return the least singular values of phi_z and of the motors' motions, shape (m, 2) (InputError)."""
-        sigma, phi_z = np.full((len(motion.q_tree), 2), np.inf), self._phi_z(motion.q_tree)
+        """Return the least singular values of phi_z, 1 without loops, and of the motors' motions, (m, 2) (InputError)."""
+        sigma, phi_z = np.ones((len(motion.q_tree), 2)), self._phi_z(motion.q_tree)
         if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
             raise InputError("excite: the motion leaves its branch")
         if phi_z.shape[1]:
@@ -201,7 +202,7 @@ class ExcitationProblem:
     def score(self, regressor: Array) -> float:
         """Return what the search makes small."""
         condition, log_det = self.values(regressor)
-        return float(np.log(condition)) if self.criterion == "condition" else -log_det
+        return float(np.log(condition)) if self.criterion == "condition" else -log_det / 2 / self.basis.shape[1]
 
     def objective(self, regressor: Array, sharpness: float) -> tuple[float, Array]:
         """Return the smoothed criterion, and its derivatives by the regressor in the determined directions."""
@@ -210,7 +211,7 @@ class ExcitationProblem:
         values = np.maximum(values, 1e-30)
         logs = np.log(values)
         if self.criterion == "log_det":
-            objective, slopes = -0.5 * float(logs.sum()), -0.5 / values
+            objective, slopes = -0.5 * float(logs.mean()), -0.5 / values / len(values)
         else:
             (high, up), (low, down) = _soft_max(sharpness * logs), _soft_max(-sharpness * logs)
             objective, slopes = 0.5 * (high + low) / sharpness, 0.5 * (up - down) / values
@@ -231,7 +232,11 @@ class ExcitationProblem:
         curvature = np.einsum("jmni,mi->jmn", rho_slopes, v) + np.einsum("imnj,mi->jmn", rho_slopes, v)
         along = base.rho.transpose(2, 0, 1)
         v_tree = [by_q.v_tree, *(base.v_tree + h_v[:, None, None] * along), *d * [base.v_tree]]
-        a_tree = [by_q.a_tree, *(base.a_tree + h_v[:, None, None] * curvature), *(base.a_tree + h_a[:, None, None] * along)]
+        a_tree = [
+            by_q.a_tree,
+            *(base.a_tree + h_v[:, None, None] * curvature),
+            *(base.a_tree + h_a[:, None, None] * along),
+        ]
         there = self._measure(
             MeasuredMotion(
                 np.zeros(3 * d * m), np.vstack([by_q.q_tree, *2 * d * [base.q_tree]]), np.vstack(v_tree), np.vstack(a_tree),
@@ -294,14 +299,22 @@ class ExcitationProblem:
             No such motion was found.
         """
         search = _Search(self, instants.motion.q_tree)
-        tightening = np.zeros(len(self.limits.names))
-        for k, (sharpness, hardness) in enumerate(STAGES):
-            x = search.run(x, sharpness, hardness, iterations if k < 2 else 1 + iterations // 2, tightening, progress)
+        tightening, best = np.zeros(len(self.limits.names)), list[tuple[float, Array, Instants]]()
+        for k, (sharpness, hardness) in enumerate(((0.0, 0.0), *STAGES)):
+            if k:  # the start itself comes first
+                share = iterations if k <= 2 else 1 + iterations // 2
+                x = search.run(x, sharpness, hardness, share, tightening, progress)
             fine = self.fine(x, search.q_tree)
-            worst = np.full(len(self.limits.names), np.inf) if fine is None else self.limits.worst(fine.quantities)
-            if fine is not None and k > 0 and worst.max() <= 0:
-                return x, fine
-            tightening = tightening + np.where(worst > 0, 1.5 * np.minimum(worst, 0.1) + k * REPAIR_STEP, 0.0)
+            worst = np.full(len(tightening), MAX_REPAIR) if fine is None else self.limits.worst(fine.quantities)
+            if fine is not None and worst.max() <= 0:
+                best = [min([*best, (self.score(fine.regressor), x, fine)], key=lambda entry: entry[0])]
+                if k >= 2:
+                    break
+            if k:
+                repair = 1.5 * np.minimum(worst, MAX_REPAIR) + k * REPAIR_STEP
+                tightening = tightening + np.where(worst > 0, repair, 0.0)
+        if best:
+            return best[0][1:]
         names = ", ".join(name for name, over in zip(self.limits.names, worst, strict=True) if over > 0)
         raise InputError(f"excite: {names}: no motion stays within this limit between the instants; widen it")
 
@@ -310,6 +323,10 @@ class ExcitationProblem:
         count = refinement * len(self.t)
         waves = fourier(np.arange(count) * self.period / count, self.period, self.harmonics)
         return self.evaluate(np.repeat(q_tree, refinement, axis=0), x, waves, smooth=False)
+
+
+class _NoStep(Exception):
+    """The line search ends at a motion that the loops cannot follow."""
 
 
 class _Search:
@@ -364,7 +381,9 @@ class _Search:
 
         def objective(y: Array) -> float:
             instants, _ = visit(y)
-            return FAILURE if instants is None else problem.objective(instants.regressor, sharpness)[0]
+            return (
+                FAILURE if instants is None else OBJECTIVE_SCALE * problem.objective(instants.regressor, sharpness)[0]
+            )
 
         def constraint(y: Array) -> Array:
             return -_soft_max(hardness * visit(y)[1])[0] / hardness
@@ -374,7 +393,8 @@ class _Search:
         def derivatives(y: Array) -> tuple[Array, Array]:
             if y.tobytes() not in slopes:
                 instants, exceeded = visit(y)
-                assert instants is not None  # a step to a motion that cannot be followed is not accepted
+                if instants is None:  # the line search found no motion that can be followed
+                    raise _NoStep
                 self.q_tree = instants.motion.q_tree
                 by_quantity, by_regressor = problem.differences(instants, y.reshape(unit.shape) * unit)
                 lower, upper = self.sides
@@ -386,15 +406,16 @@ class _Search:
                                         by_side * weights], axis=-1)  # fmt: skip
                 total = np.einsum("sdkg,skc,dc->gdc", local, problem.waves, unit).reshape(local.shape[-1], -1)
                 slopes.clear()
-                slopes[y.tobytes()] = total[0], -total[1:]
+                slopes[y.tobytes()] = OBJECTIVE_SCALE * total[0], -total[1:]
             return slopes[y.tobytes()]
 
-        minimize(
-            objective, (x / unit).ravel(), jac=lambda y: derivatives(y)[0], method="SLSQP",
-            constraints={"type": "ineq", "fun": constraint, "jac": lambda y: derivatives(y)[1]},
-            options={"maxiter": iterations, "ftol": 1e-5}, callback=lambda _: progress(),
-        )  # fmt: skip
-        return best[0][1].reshape(unit.shape) * unit
+        with suppress(_NoStep):
+            minimize(
+                objective, (x / unit).ravel(), jac=lambda y: derivatives(y)[0], method="SLSQP",
+                constraints={"type": "ineq", "fun": constraint, "jac": lambda y: derivatives(y)[1]},
+                options={"maxiter": iterations, "ftol": 1e-5 * OBJECTIVE_SCALE}, callback=lambda _: progress(),
+            )  # fmt: skip
+        return best[0][1].reshape(unit.shape) * unit if best else x
 
 
 def _soft_max(values: Array) -> tuple[Any, Array]:

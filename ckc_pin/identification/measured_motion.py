@@ -158,7 +158,9 @@ def close_many(mechanism: Mechanism, q_tree: Array, q: Array) -> Array:
     return _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d)).solve_many(guess, q)
 
 
-def motion_along(mechanism: Mechanism, t: Array, q_tree: Array, q: Array, q_dot: Array, q_ddot: Array) -> MeasuredMotion:
+def motion_along(
+    mechanism: Mechanism, t: Array, q_tree: Array, q: Array, q_dot: Array, q_ddot: Array
+) -> MeasuredMotion:
     """Return the exact motion with independent coordinates q (m, d), closed near q_tree (InputError)."""
     nearest = _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d))
     q_tree = close_many(mechanism, q_tree, q)

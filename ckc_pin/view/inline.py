@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-    Drawable = Run | LinearModel | GainLocus | Sensitivities | MotionForces | Excitation | SingularityMap | xarray.Dataset
+    Drawable = (
+        Run | LinearModel | GainLocus | Sensitivities | MotionForces | Excitation | SingularityMap | xarray.Dataset
+    )
 
 __all__ = ["Figures", "Playback"]
 
