@@ -19,6 +19,7 @@ from ckc_pin.cli.output import (
     skip_figures_without_matplotlib,
 )
 from ckc_pin.cli.signals import interrupts
+from ckc_pin.errors import InputError
 
 __all__ = ["excite"]
 
@@ -44,10 +45,10 @@ __all__ = ["excite"]
     "limits",
     metavar="NAME=VALUE",
     multiple=True,
-    help="Limit of a quantity, with wildcards: v.theta_1=3.0, a.*=20.0, tau.*=5.0, theta_1=[-2.0,-0.8]. May be repeated.",
+    help="Limit of a quantity, with wildcards: v.crank=3.0, a.*=20.0, tau.*=5.0, crank=[-2.0,-0.8]. May be repeated.",
 )
 @click.option(
-    "--margin", metavar="NUMBER", type=float, default=0.3, help="Least singular values, relative to the start's."
+    "--margin", metavar="NUMBER", type=float, default=0.3, help="Smallest singular values, relative to the start's."
 )
 @click.option(
     "--criterion",
@@ -83,6 +84,8 @@ def excite(
     as_json: bool,
 ) -> None:
     """Find motions that make parameters known. It compares them with random motions within the same limits."""
+    if not 0 < rate <= 1e5:
+        raise InputError(f"--rate {rate:g}: expected a number above zero, at most 100000")
     loaded = ckc_pin.load(mechanism, options.read_overrides("--set", settings) or None)
     if out is not None:
         make_folder(out)

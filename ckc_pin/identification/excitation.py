@@ -15,7 +15,7 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.tables import to_csv_text, to_data_frame
-from ckc_pin.base.validation import is_number, suggest_name
+from ckc_pin.base.validation import is_number, require_table, suggest_name
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.identification.excitation_problem import Criterion, ExcitationProblem, Instants, Limits, fourier
@@ -74,8 +74,8 @@ class Excitation(HasSummary):
     coefficients : (d, 1 + 2 harmonics) array
         Offset, sines and cosines of each independent coordinate, rad or m.
     condition : float
-        Condition number of the regressor in the directions of the base parameters, in typical sizes of the unknowns, its
-        rows in standard deviations of the torques.
+        Condition number of the regressor in the directions of the base parameters. Its columns are in typical sizes of
+        the unknowns, its rows in standard deviations of the torques.
     log_det : float
         Logarithm of the determinant of the information in these directions, by instant.
     rank, unknowns : int
@@ -87,7 +87,7 @@ class Excitation(HasSummary):
     active : tuple of str
         Quantities that reach their limits.
     margin : float
-        Least singular value of phi_z and of the motors' transmission to the freedoms, relative to the assembled
+        Smallest singular value of phi_z and of the motors' transmission to the freedoms, relative to the assembled
         configuration.
     run_in : float
         Time from rest to the full speed along the motion, s.
@@ -176,7 +176,7 @@ class Excitation(HasSummary):
         return np.arange(int(duration * rate * (1 + 1e-12)) + 1) / rate
 
     def to_csv(self, path: str | Path, rate: float = 100.0) -> Path:
-        """Write t and the `quantities` of run-in and one period for a robot's controller, at a rate in 1/s (InputError)."""
+        """Write t and the `quantities` of run-in and one period for a robot, at a rate in 1/s (InputError)."""
         t = self.sample_times(rate)
         write_atomic(Path(path), to_csv_text("t", t, self.quantities(t)))
         return Path(path)
@@ -194,7 +194,8 @@ class Excitation(HasSummary):
 
     def save(self, folder: str | Path, rate: float = 100.0, *, overwrite: bool = False) -> list[Path]:
         """Write excite.scene.toml with its mechanism, and excite.csv, into a folder (InputError)."""
-        scene = self.scene(output_dt=1 / rate).save(folder, "excite", overwrite=overwrite)
+        t = self.sample_times(rate)
+        scene = self.scene(output_dt=float(t[1])).save(folder, "excite", overwrite=overwrite)
         return [scene, self.to_csv(Path(folder) / "excite.csv", rate)]
 
     def summary(self) -> Summary:
@@ -288,11 +289,11 @@ def excite(
     harmonics : int
         Number of waves of each coordinate: the frequencies are multiples of 1 / period.
     limits : mapping, optional
-        By quantity, with wildcards: ``{"theta_1": [-2.0, -1.0], "v.*": 3.0, "a.*": 20.0, "tau.theta_1": 5.0}``. A number
-        is a limit of the size. They add to joint limits, and to the motors' limits of torque and speed. Independent
+        By quantity, with wildcards: ``{"theta_1": [-2.0, -1.0], "v.*": 3.0, "a.*": 20.0, "tau.*": 5.0}``. A number is a
+        limit of the size. They add to joint limits, and to the motors' limits of torque and speed. Independent
         coordinates without limits stay within 1 rad, or the mechanism's size, of the assembled configuration.
     margin : float
-        Least singular values of phi_z, and of the motors' transmission to the freedoms, relative to the assembled
+        Smallest singular values of phi_z, and of the motors' transmission to the freedoms, relative to the assembled
         configuration.
     criterion : "condition" or "log_det"
         Make the condition number small, or the determinant of the information large.
@@ -321,14 +322,17 @@ def excite(
     mechanism.refuse_prescribed_joints("excite")
     _require_driven(mechanism)
     _require_numbers(period, harmonics, margin, criterion, random, iterations, seed)
+    require_table(limits or {}, "excite: limits", 'a table by quantity, as {"tau.*": 5.0}')
+    require_table(noise or {}, "excite: noise", 'a table by motor, as {"tau.theta_1": 0.1}')
+    parameters = (parameters,) if isinstance(parameters, str) else parameters
     try:
         regressor = TorqueRegressor(mechanism, parameters)
     except InputError as error:
         raise InputError(str(error).replace("identify:", "excite:", 1)) from None
     if not regressor.unknowns:
         raise InputError('excite: parameters: nothing to identify; give names, such as "link.*.inertial"')
-    table = _make_limits(mechanism, limits or {}, margin)
-    problem = ExcitationProblem(regressor, float(period), harmonics, table, _noise(mechanism, noise or {}), criterion)
+    bounds = _make_limits(mechanism, limits or {}, margin)
+    problem = ExcitationProblem(regressor, float(period), harmonics, bounds, _noise(mechanism, noise or {}), criterion)
     with one_blas_thread():
         return _search(problem, tuple(parameters), random, iterations, seed, progress or (lambda done, total: None))
 
@@ -339,17 +343,16 @@ def _search(
 ) -> Excitation:  # fmt: skip
     rng, limits, total = np.random.default_rng(seed), problem.limits, count + 2 * iterations
     feasible: list[tuple[Array, Instants]] = []
-    least = np.full(len(limits.names), np.inf)
+    closest = np.full(len(limits.names), np.inf)
     for k in range(count):
         motions, violation = problem.random_motion(rng)
         feasible += motions
-        least = violation if violation.max() < least.max() else least
+        closest = violation if violation.max() < closest.max() else closest
         progress(k + 1, total)
     if not feasible:
-        exceeded = [f"{name} by {100 * x:.3g} %" for name, x in zip(limits.names, least, strict=True) if x > 0]
-        which = (
-            f"the closest one exceeds {', '.join(exceeded)} of its limit" if np.isfinite(least.max()) else "none closes"
-        )
+        excess = zip(limits.names, closest * limits.scale, strict=True)
+        exceeded = ", ".join(f"{name} by {x:.3g}" for name, x in excess if x > 0)
+        which = f"the closest one exceeds {exceeded}" if np.isfinite(closest.max()) else "the loops do not close"
         raise InputError(f"excite: limits: none of {count} random motions is within them; {which}")
     problem.set_basis([instants.regressor for _, instants in feasible[:MAX_BASIS_MOTIONS]])
     if not problem.basis.shape[1]:
@@ -396,8 +399,8 @@ def _require_driven(mechanism: Mechanism) -> None:
     driven = np.linalg.matrix_rank(mechanism.motors.transmission @ mechanism.assembled.rho)
     if driven < mechanism.d:
         raise InputError(
-            f"excite: the motors {', '.join(mechanism.motors.names)} drive {driven} of {mechanism.d} freedoms; no torques "
-            "follow a given motion"
+            f"excite: the motors {', '.join(mechanism.motors.names)} drive {driven} of {mechanism.d} freedoms; "
+            "no torques follow a prescribed motion"
         )
     of_root = [name for name in mechanism.independent if name in mechanism.tree.free_coordinates]
     if of_root:
@@ -411,10 +414,10 @@ def _require_numbers(
         raise InputError(f"excite: period: expected a number of seconds above zero, got {period!r:.40}")
     if not (is_number(margin) and 0 <= margin < 1):
         raise InputError(f"excite: margin: expected a number from 0 to below 1, got {margin!r:.40}")
-    for name, value, least, most in (("harmonics", harmonics, 1, 50), ("random", random, 1, 100_000),
+    for name, value, lower, upper in (("harmonics", harmonics, 1, 50), ("random", random, 1, 100_000),
                                      ("iterations", iterations, 1, 100_000), ("seed", seed, 0, 2**63 - 1)):  # fmt: skip
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            raise InputError(f"excite: {name}: expected an integer from {least} to {most}, got {value!r:.40}")
+        if type(value) is not int or not lower <= value <= upper:
+            raise InputError(f"excite: {name}: expected an integer from {lower} to {upper}, got {value!r:.40}")
     if criterion not in get_args(Criterion):
         raise InputError(f"excite: criterion: expected {' or '.join(get_args(Criterion))}, got {criterion!r:.40}")
 
@@ -433,7 +436,7 @@ def _noise(mechanism: Mechanism, noise: Mapping[str, float]) -> Array:
     return np.array([float(noise.get(name, 1.0)) for name in names])
 
 
-def _make_limits(mechanism: Mechanism, given: Mapping[str, float | Sequence[float]], margin: float) -> Limits:
+def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[float]], margin: float) -> Limits:
     """Return the limits of all quantities: those of joints and motors, given ones, and default ranges (InputError)."""
     coordinates, motors, tree = mechanism.coordinates, mechanism.motors, mechanism.tree
     names = (*coordinates, *(f"v.{x}" for x in coordinates), *(f"a.{x}" for x in coordinates),
@@ -444,15 +447,18 @@ def _make_limits(mechanism: Mechanism, given: Mapping[str, float | Sequence[floa
     lower = np.concatenate([low, -free, -motors.speed_limit, motors.torque_limit[0], margin * singular])
     upper = np.concatenate([high, free, motors.speed_limit, motors.torque_limit[1], [np.inf, np.inf]])
     choices = names[:-2]
-    for pattern, limit in given.items():
+    for pattern, limit in table.items():
         where = f"excite: limits: {pattern}"
         matches = [k for k, name in enumerate(choices) if fnmatchcase(name, pattern)]
         if not matches:
-            raise InputError(f"{where}: no such quantity{suggest_name(pattern, choices)}; there are COORDINATE, v.COORDINATE, "
-                             f"a.COORDINATE, tau.MOTOR and speed.MOTOR of {', '.join(coordinates)}")  # fmt: skip
+            raise InputError(
+                f"{where}: no such quantity{suggest_name(pattern, choices)}; there are COORDINATE, v.COORDINATE, "
+                f"a.COORDINATE, tau.MOTOR and speed.MOTOR of {', '.join(coordinates)}"
+            )
         is_pair = isinstance(limit, Sequence) and len(limit) == 2 and all(map(is_number, limit))
-        if not is_pair and not (is_number(limit) and limit > 0 and matches[0] >= len(coordinates)):  # type: ignore[operator]
-            size = "" if matches[0] < len(coordinates) else " or a number above zero"
+        is_coordinate = matches[0] < len(coordinates)
+        if not is_pair and (is_coordinate or not is_number(limit) or limit <= 0):  # type: ignore[operator]
+            size = "" if is_coordinate else " or a number above zero"
             raise InputError(f"{where}: expected [lower, upper]{size}, got {limit!r:.40}")
         pair = limit if is_pair else (-limit, limit)  # type: ignore[operator]
         lower[matches] = np.maximum(lower[matches], pair[0])  # type: ignore[index]
@@ -467,13 +473,14 @@ def _make_limits(mechanism: Mechanism, given: Mapping[str, float | Sequence[floa
         raise InputError(f"excite: limits: {empty}: no value is between {lower[k]:g} and {upper[k]:g}")
     both = np.isfinite(lower) & np.isfinite(upper)
     one = np.where(np.isfinite(upper), np.abs(upper), np.where(np.isfinite(lower), np.abs(lower), 1.0))
-    scale = np.maximum(np.where(both, (np.where(both, upper, 1.0) - np.where(both, lower, 0.0)) / 2, one), 1e-12)
+    one = np.where(one > 0, one, 1.0)
+    scale = np.where(both, (np.where(both, upper, 1.0) - np.where(both, lower, 0.0)) / 2, one)
     scale[-2:] = singular
     return Limits(names, lower, upper, scale)
 
 
 def _singular_values(mechanism: Mechanism) -> Array:
-    """Return the least singular values of phi_z, 1 without loops, and of the motors' motions, as assembled."""
+    """Return the smallest singular values of phi_z, 1 without loops, and of the motors' motions, as assembled."""
     at = mechanism.assembled
     of_motors = np.linalg.svd(mechanism.motors.transmission @ at.rho, compute_uv=False)[mechanism.d - 1]
     phi_z = at.J[mechanism.independent_rows][:, mechanism.partition.z]
@@ -482,9 +489,9 @@ def _singular_values(mechanism: Mechanism) -> Array:
 
 def _units(mechanism: Mechanism) -> dict[str, str]:
     """Return units of coordinates, rates, accelerations and torques by name."""
-    units = {}
+    units: dict[str, str] = {}
     for prefix, per in (("", ""), ("v.", "/s"), ("a.", "/s²")):
         names = (f"{prefix}{name}" for name in mechanism.coordinates)
         units.update(zip(names, mechanism.tree.units(per), strict=True))
-    names = (f"tau.{name}" for name in mechanism.motors.names)
-    return units | dict(zip(names, motor_units(mechanism), strict=True))
+    motors = (f"tau.{name}" for name in mechanism.motors.names)
+    return units | dict(zip(motors, motor_units(mechanism), strict=True))

@@ -61,7 +61,7 @@ class Limits(Immutable):
         return np.isfinite(self.lower) | np.isfinite(self.upper)
 
     def violation(self, quantities: Array) -> Array:
-        """Return by how much instants (m, k) exceed lower and upper limits, in sizes, shape (2, m, k); negative inside."""
+        """Return by how much instants (m, k) exceed both limits, in sizes, shape (2, m, k); negative inside."""
         return np.array([self.lower - quantities, quantities - self.upper]) / self.scale
 
     def worst(self, quantities: Array) -> Array:
@@ -148,7 +148,7 @@ class ExcitationProblem:
             return None
 
     def follow(self, q_tree: Array, q: Array) -> Array:
-        """Return closed configurations (m, nq) near independent coordinates q, by continuation from others (InputError)."""
+        """Return closed configurations (m, nq) near q (m, d), by continuation from others (InputError)."""
         tree, at = self.mechanism.tree, self.mechanism.partition.q
         numbers = np.array([tree.to_coordinates(one) for one in q_tree])
         missing = q - numbers[:, at]
@@ -158,7 +158,7 @@ class ExcitationProblem:
         return q_tree
 
     def instants(self, q_tree: Array, q: Array, v: Array, a: Array, *, smooth: bool = True) -> Instants:
-        """Return quantities and regressor of instants, each by itself, from closed configurations near q (InputError)."""
+        """Return quantities and regressor of instants from closed configurations near q (InputError)."""
         motion = motion_along(self.mechanism, np.zeros(len(q)), q_tree, q, v, a)
         return self._measure(motion, self._singular_values(motion), smooth=smooth)
 
@@ -167,15 +167,16 @@ class ExcitationProblem:
         if smooth:
             motion = replace(motion, v_std=SLOW * 2 * np.pi / self.period * tree.step_scale)
         columns, force = self.regressor.rows(motion)
-        to_motors = np.linalg.pinv(np.einsum("knd,mn->kdm", motion.rho, motors.transmission))
+        to_forces = np.einsum("knd,mn->kdm", motion.rho, motors.transmission)
         numbers = np.array([tree.to_coordinates(one) for one in motion.q_tree])
-        tau = np.einsum("kmd,kd->km", to_motors, force)
+        tau = np.einsum("kmd,kd->km", np.linalg.pinv(to_forces), force)
+        whitening = np.linalg.pinv(to_forces * self.noise)
         shafts = motion.v_tree @ motors.transmission.T
         quantities = np.hstack([numbers, motion.v_tree, motion.a_tree, shafts, tau, sigma])
-        return Instants(motion, quantities, to_motors @ (columns * self.regressor.scale) / self.noise[:, None])
+        return Instants(motion, quantities, whitening @ (columns * self.regressor.scale))
 
     def _singular_values(self, motion: MeasuredMotion) -> Array:
-        """Return the least singular values of phi_z, 1 without loops, and of the motors' motions, (m, 2) (InputError)."""
+        """Return the smallest singular values of phi_z, 1 without loops, and of the motors, (m, 2) (InputError)."""
         sigma, phi_z = np.ones((len(motion.q_tree), 2)), self._phi_z(motion.q_tree)
         if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
             raise InputError("excite: the motion leaves its branch")
@@ -218,7 +219,7 @@ class ExcitationProblem:
         return objective, 2 / len(W) * W @ ((vectors * slopes) @ vectors.T)
 
     def differences(self, instants: Instants, x: Array) -> tuple[Array, Array]:
-        """Return derivatives of quantities (3, d, m, k) and of the regressor (3, d, m, motors, r) by q, q_dot and q_ddot."""
+        """Return derivatives of quantities (3, d, m, k) and regressor (3, d, m, motors, r) by q, q_dot and q_ddot."""
         base, d, m = instants.motion, self.d, len(self.t)
         q, v, a = np.einsum("smc,dc->smd", self.waves, x)
         h_q, h_v, h_a = steps = DIFFERENCE_STEP * self.size
@@ -239,7 +240,8 @@ class ExcitationProblem:
         ]
         there = self._measure(
             MeasuredMotion(
-                np.zeros(3 * d * m), np.vstack([by_q.q_tree, *2 * d * [base.q_tree]]), np.vstack(v_tree), np.vstack(a_tree),
+                np.zeros(3 * d * m), np.vstack([by_q.q_tree, *2 * d * [base.q_tree]]), np.vstack(v_tree),
+                np.vstack(a_tree),
                 np.concatenate([by_q.rho, *2 * d * [base.rho]]), base.v_std,
             ),
             np.vstack([self._singular_values(by_q), *2 * d * [instants.quantities[:, -2:]]]),
@@ -254,7 +256,7 @@ class ExcitationProblem:
     # --- search ----------------------------------------------------------------------------------
 
     def random_motion(self, rng: np.random.Generator) -> tuple[list[tuple[Array, Instants]], Array]:
-        """Return a random motion with the largest amplitude within the limits, as a list that is empty if there is none.
+        """Return a random motion with the largest amplitude within the limits, in a list that may be empty.
 
         Beside it, the violation of each limit at the amplitude where the largest is smallest.
         """
@@ -266,13 +268,13 @@ class ExcitationProblem:
         centre = np.zeros_like(x)
         centre[:, 0] = self.start
         q_tree = np.repeat(self.mechanism.assembled.q_tree[None], len(self.t), axis=0)
-        best, least = list[tuple[Array, Instants]](), np.full(len(self.limits.names), np.inf)
+        best, closest = list[tuple[Array, Instants]](), np.full(len(self.limits.names), np.inf)
         amplitude, low, high = 1.0, 0.0, 1.0
         for _ in range(BISECTIONS):
             scaled = centre + amplitude * (x - centre)
             instants = self.evaluate(q_tree, scaled)
-            worst = np.full(len(least), np.inf) if instants is None else self.limits.worst(instants.quantities)
-            least = worst if worst.max() < least.max() else least
+            worst = np.full(len(closest), np.inf) if instants is None else self.limits.worst(instants.quantities)
+            closest = worst if worst.max() < closest.max() else closest
             if instants is not None and worst.max() <= 0:
                 best, low, q_tree = [(scaled, instants)], amplitude, instants.motion.q_tree
             else:
@@ -280,7 +282,7 @@ class ExcitationProblem:
             if low == 1.0:
                 break
             amplitude = (low + high) / 2
-        return best, least
+        return best, closest
 
     def set_basis(self, regressors: list[Array]) -> None:
         """Take the directions of the unknowns that these motions together determine."""
@@ -291,7 +293,7 @@ class ExcitationProblem:
     def optimize(
         self, x: Array, instants: Instants, iterations: int, progress: Callable[[], None]
     ) -> tuple[Array, Instants]:
-        """Return a better motion than that of x, within the limits on a grid that is five times finer, and its instants.
+        """Return a better motion than that of x, within the limits on a grid that is five times finer.
 
         Raises
         ------

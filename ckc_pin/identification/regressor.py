@@ -114,9 +114,7 @@ class TorqueRegressor:
                 of_tree = pin.computeJointTorqueRegressor(
                     tree.model, tree.data, motion.q_tree[k], motion.v_tree[k], motion.a_tree[k]
                 )
-                of_bodies[k] = motion.rho[k].T @ of_tree.reshape(
-                    tree.n, -1
-                )  # Pinocchio returns a single row as a vector.
+                of_bodies[k] = motion.rho[k].T @ of_tree.reshape(tree.n, -1)  # a single row comes as a vector
         if springs.any or springs.joint_damping.any():
             for k in range(count):
                 force[k] -= springs.elastic_force(motion.q_tree[k])

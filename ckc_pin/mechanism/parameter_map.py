@@ -22,14 +22,7 @@ from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, Value, split_component
 from ckc_pin.mechanism.rows import Affine, Distance
 from ckc_pin.mechanism.spec import FrameSpec, MechanismSpec
 
-__all__ = [
-    "ParameterMap",
-    "inertial_rotation",
-    "list_line_springs",
-    "list_loop_frames",
-    "list_spring_ends",
-    "model_numbers",
-]
+__all__ = ["ParameterMap", "inertial_rotation", "list_line_springs", "list_loop_frames", "list_spring_ends", "model_numbers"]
 
 Numbers = NDArray[Any]  # real, or complex for a derivative
 

@@ -46,8 +46,8 @@ class Figures(Mapping[str, "Figure"]):
 
     Parameters
     ----------
-    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap,
-        or Dataset of an ensemble
+    results : sequence of Run, or of one LinearModel, GainLocus, Sensitivities, MotionForces, Excitation,
+        SingularityMap, or Dataset of an ensemble
 
     Raises
     ------

@@ -22,7 +22,8 @@ from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, f
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_excitation", "draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces", "save_precision",
+__all__ = ["draw_excitation", "draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces",
+           "save_precision",
            "save_sensitivities"]  # fmt: skip
 
 MAX_NOTE_MOTORS = 3  # named in a note; longer notes exceed the panel
