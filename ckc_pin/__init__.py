@@ -253,7 +253,7 @@ def plot(
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap or xarray.Dataset
+    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap or Dataset
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
         The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
         map over two.

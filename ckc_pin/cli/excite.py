@@ -34,7 +34,7 @@ __all__ = ["excite"]
 @options.mechanism
 @click.option(
     "--parameters",
-    metavar="NAME,...",
+    metavar="NAMES",
     default="link.*.inertial",
     help="Parameters to make known, with wildcards, separated by commas.",
 )

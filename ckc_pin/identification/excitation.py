@@ -342,30 +342,36 @@ def _search(
     progress: Callable[[float, float], None],
 ) -> Excitation:  # fmt: skip
     rng, limits, total = np.random.default_rng(seed), problem.limits, count + 2 * iterations
-    feasible: list[tuple[Array, Instants]] = []
+    waiting, values = list[tuple[Array, Instants]](), list[tuple[float, float]]()
+    best: tuple[float, Array, Instants] | None = None
     closest = np.full(len(limits.names), np.inf)
     for k in range(count):
         motions, violation = problem.random_motion(rng)
-        feasible += motions
+        waiting += motions
         closest = violation if violation.max() < closest.max() else closest
+        if waiting and (values or len(waiting) == MAX_BASIS_MOTIONS or k == count - 1):
+            if not values:
+                problem.set_basis([instants.regressor for _, instants in waiting])
+                if not problem.basis.shape[1]:
+                    names = ", ".join(parameters)
+                    raise InputError(f"excite: parameters: nothing to identify; no motion shows {names} in the torques")
+            values += [problem.values(instants.regressor) for _, instants in waiting]
+            ranked = [(problem.score(instants.regressor), x, instants) for x, instants in waiting]
+            best = min(ranked if best is None else [best, *ranked], key=lambda entry: entry[0])
+            waiting.clear()
         progress(k + 1, total)
-    if not feasible:
+    if best is None:
         excess = zip(limits.names, closest * limits.scale, strict=True)
         exceeded = ", ".join(f"{name} by {x:.3g}" for name, x in excess if x > 0)
         which = f"the closest one exceeds {exceeded}" if np.isfinite(closest.max()) else "the loops do not close"
         raise InputError(f"excite: limits: none of {count} random motions is within them; {which}")
-    problem.set_basis([instants.regressor for _, instants in feasible[:MAX_BASIS_MOTIONS]])
-    if not problem.basis.shape[1]:
-        raise InputError(
-            f"excite: parameters: nothing to identify; no motion shows {', '.join(parameters)} in the torques"
-        )
-    values = np.array([problem.values(instants.regressor) for _, instants in feasible])
-    x, start = feasible[int(np.argmin([problem.score(instants.regressor) for _, instants in feasible]))]
+    _, x, start = best
+    condition, log_det = np.array(values).T
     done = iter(range(count, 10**9))
     x, fine = problem.optimize(x, start, iterations, lambda: progress(min(next(done) + 1, total), total))
     return _result(problem, parameters, x, fine, RandomMotions(
-        count, len(feasible), (float(values[:, 0].min()), float(np.median(values[:, 0]))),
-        (float(values[:, 1].max()), float(np.median(values[:, 1])))))  # fmt: skip
+        count, len(values), (float(condition.min()), float(np.median(condition))),
+        (float(log_det.max()), float(np.median(log_det)))))  # fmt: skip
 
 
 def _result(

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["draw_excitation", "draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces",
-           "save_precision",
-           "save_sensitivities"]  # fmt: skip
+           "save_precision", "save_sensitivities"]  # fmt: skip
 
 MAX_NOTE_MOTORS = 3  # named in a note; longer notes exceed the panel
 MAX_EXCITATION_ROWS = 1000
