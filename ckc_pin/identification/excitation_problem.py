@@ -26,6 +26,7 @@ Criterion = Literal["condition", "log_det"]
 
 SAMPLES_PER_WAVE = 16  # of the highest harmonic, on the grid that is optimized
 MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism
+MAX_DECAY = 1.5  # of the amplitudes of random motions with the order of the wave, an exponent
 BISECTIONS = 7  # of the amplitude of a random motion
 DIFFERENCE_STEP = 1e-6  # relative to typical sizes
 SLOW = 0.02  # of the typical rate: dry friction is smoothed below it while derivatives are needed
@@ -128,8 +129,8 @@ class ExcitationProblem:
         self.start = tree.to_coordinates(self.mechanism.assembled.q_tree)[at]
         self.size = np.array([1.0, 2 * np.pi / period, (2 * np.pi / period) ** 2])[:, None] * tree.step_scale[at]
         self.lower, self.upper = limits.lower[at], limits.upper[at]
-        order = np.concatenate([[1.0], *2 * [np.arange(1, harmonics + 1)]])
-        self.unit = (self.upper - self.lower)[:, None] / 2 / order  # of a Fourier coefficient
+        self.order = np.concatenate([[1.0], *2 * [np.arange(1, harmonics + 1)]])
+        self.unit = (self.upper - self.lower)[:, None] / 2 / self.order  # of a Fourier coefficient
         self._sign = np.sign(np.linalg.det(self._phi_z(self.mechanism.assembled.q_tree[None])))
         self.basis = np.eye(len(regressor.unknowns))
 
@@ -262,7 +263,8 @@ class ExcitationProblem:
         """
         half = (self.upper - self.lower) / 2
         offset = self.lower + half * rng.uniform(0.4, 1.6, self.d)
-        x = np.hstack([offset[:, None], rng.normal(size=(self.d, 2 * self.harmonics)) * self.unit[:, 1:]])
+        spectrum = self.order[1:] ** -rng.uniform(0.0, MAX_DECAY)
+        x = np.hstack([offset[:, None], rng.normal(size=(self.d, 2 * self.harmonics)) * spectrum])
         reach = np.abs(np.einsum("mc,dc->md", self.waves[0, :, 1:], x[:, 1:])).max(axis=0)
         x[:, 1:] *= (np.minimum(offset - self.lower, self.upper - offset) / reach)[:, None]
         centre = np.zeros_like(x)

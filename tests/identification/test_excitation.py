@@ -13,7 +13,7 @@ import ckc_pin
 from ckc_pin import Excitation, InputError, Mechanism, excite
 from tests.contract.helpers.command import ckc
 
-LIMITS = {"tau.*": 1.2, "v.theta_*": 1.2, "a.theta_1": 2.0}  # of five_bar
+LIMITS = {"tau.*": 1.0, "v.theta_*": 1.6, "a.theta_1": 2.0}  # of five_bar
 
 MASS, LENGTH, INERTIA = 1.5, 0.3, 0.02  # of the pendulum: at its centre, which is LENGTH from the hinge
 PENDULUM = f"""
@@ -105,8 +105,8 @@ def test_limits_hold_between_the_instants(tmp_path: Path) -> None:
     for refinement, excess in ((5, 1e-9), (7, 1e-3)):
         forces = inverse(result, tmp_path, refinement)
         assert forces.status == "done"
-        assert np.abs(forces.tau).max() <= 1.2 * (1 + excess)
-        assert np.abs(forces.v_tree).max() <= 1.2 * (1 + excess)
+        assert np.abs(forces.tau).max() <= 1.0 * (1 + excess)
+        assert np.abs(forces.v_tree).max() <= 1.6 * (1 + excess)
         assert np.abs(forces["a.theta_1"]).max() <= 2.0 * (1 + excess)
         assert forces["sigma_min"].min() >= 0.3 * start * (1 - excess)
     assert {"tau.theta_1", "tau.theta_3"} & set(result.active)
@@ -140,7 +140,7 @@ def test_run_in_starts_at_rest_and_its_rates_are_derivatives() -> None:
     start = result.quantities(np.zeros(1))
     assert all(start[f"{order}.{name}"][0] == 0.0 for order in "va" for name in result.mechanism.coordinates)
     run_in = result.quantities(np.linspace(0.0, result.run_in, 1001))
-    assert max(np.abs(run_in[f"tau.{name}"]).max() for name in ("theta_1", "theta_3")) <= 1.2
+    assert max(np.abs(run_in[f"tau.{name}"]).max() for name in ("theta_1", "theta_3")) <= 1.0
 
 
 def test_log_det_is_larger_than_that_of_random_motions_and_grows_with_amplitude() -> None:
