@@ -18,11 +18,18 @@ from ckc_pin.base.tables import to_csv_text, to_data_frame
 from ckc_pin.base.validation import is_number, require_table, suggest_name
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
-from ckc_pin.identification.excitation_problem import Criterion, ExcitationProblem, Instants, Limits, fourier
+from ckc_pin.identification.excitation_problem import (
+    Criterion,
+    ExcitationProblem,
+    Instants,
+    Limits,
+    fourier,
+    singular_values,
+)
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.units import motor_units
+from ckc_pin.run.columns import list_quantities
 from ckc_pin.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -200,8 +207,8 @@ class Excitation(HasSummary):
 
     def summary(self) -> Summary:
         """Return condition number beside that of random motions, coefficients, largest values and active limits."""
-        random, units = self.random, _units(self.mechanism)
-        largest = [f"{name} {size:.4g} {units[name]}" for name, size in self.largest().items()]
+        random, units = self.random, list_quantities(self.mechanism)
+        largest = [f"{name} {size:.4g} {units[name].unit}" for name, size in self.largest().items()]
         rows: list[Row] = [
             ("base", f"{self.rank} combinations of {self.unknowns} unknowns"),
             ("condition", f"{self.condition:.4g}; random motions: best {random.condition[0]:.4g}, "
@@ -216,7 +223,7 @@ class Excitation(HasSummary):
         ]  # fmt: skip
         for name, wave in self.harmonics.items():
             sizes = "  ".join(f"{amplitude:.4g}" for amplitude, _, _ in wave["harmonics"])
-            rows.append((name, f"{wave['offset']:.4g} {units[name]}, amplitudes {sizes}"))
+            rows.append((name, f"{wave['offset']:.4g} {units[name].unit}, amplitudes {sizes}"))
         rows += [("warning", warning) for warning in self.warnings]
         return Summary(f"Excitation of {self.mechanism.name}, period {self.period:g} s", rows)
 
@@ -400,6 +407,8 @@ def _result(
 
 def _require_driven(mechanism: Mechanism) -> None:
     """Refuse mechanisms whose motors do not determine the motion, and free roots."""
+    if not mechanism.d:
+        raise InputError(f"excite: {mechanism.name} has no freedoms, so that nothing moves")
     if not mechanism.motors.names:
         raise InputError(f"excite: {mechanism.name} has no motors, whose torques would be measured; add [[motor]]")
     driven = np.linalg.matrix_rank(mechanism.motors.transmission @ mechanism.assembled.rho)
@@ -430,16 +439,11 @@ def _require_numbers(
 
 def _noise(mechanism: Mechanism, noise: Mapping[str, float]) -> Array:
     """Return standard deviations of the motors' torques, 1 if none are given (InputError)."""
-    names = [f"tau.{name}" for name in mechanism.motors.names]
-    unknown = next((name for name in noise if name not in names), None)
-    if unknown is not None:
-        raise InputError(f"excite: noise: no quantity {unknown!r}; expected {', '.join(names)}")
-    wrong = next(
-        (name for name in names if noise and not (is_number(noise.get(name)) and 0 < noise[name] < np.inf)), None
-    )
-    if wrong is not None:
-        raise InputError(f"excite: noise: {wrong}: expected a number above zero, got {noise.get(wrong)!r:.40}")
-    return np.array([float(noise.get(name, 1.0)) for name in names])
+    values = {name.removeprefix("tau."): value for name, value in noise.items()}
+    std = mechanism.motors.vector(values, "excite: noise", fill=None if noise else 1.0)
+    if not np.all((std > 0) & np.isfinite(std)):
+        raise InputError(f"excite: noise: expected numbers above zero, got {dict(noise)!r:.80}")
+    return std
 
 
 def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[float]], margin: float) -> Limits:
@@ -448,7 +452,8 @@ def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[floa
     names = (*coordinates, *(f"v.{x}" for x in coordinates), *(f"a.{x}" for x in coordinates),
              *(f"speed.{x}" for x in motors.names), *(f"tau.{x}" for x in motors.names), "sigma_min.phi_z",
              "sigma_min.motors")  # fmt: skip
-    free, singular = np.full(2 * tree.n, np.inf), _singular_values(mechanism)
+    assembled, free = mechanism.assembled, np.full(2 * tree.n, np.inf)
+    (singular,), _ = singular_values(mechanism, assembled.q_tree[None], assembled.rho[None])
     low, high = tree.limits()
     lower = np.concatenate([low, -free, -motors.speed_limit, motors.torque_limit[0], margin * singular])
     upper = np.concatenate([high, free, motors.speed_limit, motors.torque_limit[1], [np.inf, np.inf]])
@@ -470,7 +475,7 @@ def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[floa
         lower[matches] = np.maximum(lower[matches], pair[0])  # type: ignore[index]
         upper[matches] = np.minimum(upper[matches], pair[1])  # type: ignore[index]
     at = mechanism.partition.q
-    start, reach = tree.to_coordinates(mechanism.assembled.q_tree)[at], DEFAULT_RANGE * tree.step_scale[at]
+    start, reach = tree.to_coordinates(assembled.q_tree)[at], DEFAULT_RANGE * tree.step_scale[at]
     lower[at] = np.where(np.isfinite(lower[at]), lower[at], np.minimum(start, upper[at]) - reach)
     upper[at] = np.where(np.isfinite(upper[at]), upper[at], np.maximum(start, lower[at]) + reach)
     empty = next((name for name, a, b in zip(names, lower, upper, strict=True) if not a < b), None)
@@ -483,21 +488,3 @@ def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[floa
     scale = np.where(both, (np.where(both, upper, 1.0) - np.where(both, lower, 0.0)) / 2, one)
     scale[-2:] = singular
     return Limits(names, lower, upper, scale)
-
-
-def _singular_values(mechanism: Mechanism) -> Array:
-    """Return the smallest singular values of phi_z, 1 without loops, and of the motors' motions, as assembled."""
-    at = mechanism.assembled
-    of_motors = np.linalg.svd(mechanism.motors.transmission @ at.rho, compute_uv=False)[mechanism.d - 1]
-    phi_z = at.J[mechanism.independent_rows][:, mechanism.partition.z]
-    return np.array([np.linalg.svd(phi_z, compute_uv=False)[-1] if len(phi_z) else 1.0, of_motors])
-
-
-def _units(mechanism: Mechanism) -> dict[str, str]:
-    """Return units of coordinates, rates, accelerations and torques by name."""
-    units: dict[str, str] = {}
-    for prefix, per in (("", ""), ("v.", "/s"), ("a.", "/s²")):
-        names = (f"{prefix}{name}" for name in mechanism.coordinates)
-        units.update(zip(names, mechanism.tree.units(per), strict=True))
-    motors = (f"tau.{name}" for name in mechanism.motors.names)
-    return units | dict(zip(motors, motor_units(mechanism), strict=True))

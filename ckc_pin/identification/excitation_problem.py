@@ -19,8 +19,9 @@ from ckc_pin.identification.fit import STRUCTURAL_RANK_TOLERANCE
 from ckc_pin.identification.measured_motion import MeasuredMotion, close_many, motion_along
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.mechanism.batch import evaluate_closure
+from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Criterion", "ExcitationProblem", "Instants", "Limits", "fourier"]
+__all__ = ["Criterion", "ExcitationProblem", "Instants", "Limits", "fourier", "singular_values"]
 
 Criterion = Literal["condition", "log_det"]
 
@@ -96,6 +97,20 @@ def fourier(t: Array, period: float, harmonics: int) -> Array:
                      np.hstack([0 * one, -(w**2) * sine, -(w**2) * cosine])])  # fmt: skip
 
 
+def singular_values(mechanism: Mechanism, q_tree: Array, rho: Array) -> tuple[Array, Array]:
+    """Return the smallest singular values of phi_z, 1 without loops, and of the motors, (m, 2), and signs of det phi_z.
+
+    Redundant rows are left out of phi_z.
+    """
+    _, J = evaluate_closure(mechanism.tree, mechanism.closure, q_tree)
+    phi_z = J[:, mechanism.independent_rows][:, :, mechanism.partition.z]
+    sigma = np.ones((len(q_tree), 2))
+    if phi_z.shape[1]:
+        sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
+    sigma[:, 1] = np.linalg.svd(mechanism.motors.transmission @ rho, compute_uv=False)[:, -1]
+    return sigma, np.sign(np.linalg.det(phi_z))
+
+
 class ExcitationProblem:
     """The best motion of a period within limits.
 
@@ -131,7 +146,8 @@ class ExcitationProblem:
         self.lower, self.upper = limits.lower[at], limits.upper[at]
         self.order = np.concatenate([[1.0], *2 * [np.arange(1, harmonics + 1)]])
         self.unit = (self.upper - self.lower)[:, None] / 2 / self.order  # of a Fourier coefficient
-        self._sign = np.sign(np.linalg.det(self._phi_z(self.mechanism.assembled.q_tree[None])))
+        assembled = self.mechanism.assembled
+        _, self._sign = singular_values(self.mechanism, assembled.q_tree[None], assembled.rho[None])
         self.basis = np.eye(len(regressor.unknowns))
 
     # --- motions at instants ---------------------------------------------------------------------
@@ -161,7 +177,7 @@ class ExcitationProblem:
     def instants(self, q_tree: Array, q: Array, v: Array, a: Array, *, smooth: bool = True) -> Instants:
         """Return quantities and regressor of instants from closed configurations near q (InputError)."""
         motion = motion_along(self.mechanism, np.zeros(len(q)), q_tree, q, v, a)
-        return self._measure(motion, self._singular_values(motion), smooth=smooth)
+        return self._measure(motion, self._on_branch(motion), smooth=smooth)
 
     def _measure(self, motion: MeasuredMotion, sigma: Array, *, smooth: bool = True) -> Instants:
         tree, motors = self.mechanism.tree, self.mechanism.motors
@@ -176,21 +192,12 @@ class ExcitationProblem:
         quantities = np.hstack([numbers, motion.v_tree, motion.a_tree, shafts, tau, sigma])
         return Instants(motion, quantities, whitening @ (columns * self.regressor.scale))
 
-    def _singular_values(self, motion: MeasuredMotion) -> Array:
-        """Return the smallest singular values of phi_z, 1 without loops, and of the motors, (m, 2) (InputError)."""
-        sigma, phi_z = np.ones((len(motion.q_tree), 2)), self._phi_z(motion.q_tree)
-        if np.any(np.sign(np.linalg.det(phi_z)) != self._sign):
+    def _on_branch(self, motion: MeasuredMotion) -> Array:
+        """Return the singular values of instants, or raise InputError if the motion leaves its branch."""
+        sigma, sign = singular_values(self.mechanism, motion.q_tree, motion.rho)
+        if np.any(sign != self._sign):
             raise InputError("excite: the motion leaves its branch")
-        if phi_z.shape[1]:
-            sigma[:, 0] = np.linalg.svd(phi_z, compute_uv=False)[:, -1]
-        sigma[:, 1] = np.linalg.svd(self.mechanism.motors.transmission @ motion.rho, compute_uv=False)[:, -1]
         return sigma
-
-    def _phi_z(self, q_tree: Array) -> Array:
-        """Return phi_z (m, rows, rows) without redundant rows."""
-        mechanism = self.mechanism
-        _, J = evaluate_closure(mechanism.tree, mechanism.closure, q_tree)
-        return J[:, mechanism.independent_rows][:, :, mechanism.partition.z]
 
     # --- criterion -------------------------------------------------------------------------------
 
@@ -245,7 +252,7 @@ class ExcitationProblem:
                 np.vstack(a_tree),
                 np.concatenate([by_q.rho, *2 * d * [base.rho]]), base.v_std,
             ),
-            np.vstack([self._singular_values(by_q), *2 * d * [instants.quantities[:, -2:]]]),
+            np.vstack([self._on_branch(by_q), *2 * d * [instants.quantities[:, -2:]]]),
         )  # fmt: skip
         by_quantity = there.quantities.reshape(3 * d, m, -1) - instants.quantities
         by_regressor = (there.regressor.reshape(3 * d, *instants.regressor.shape) - instants.regressor) @ self.basis

@@ -201,9 +201,10 @@ def test_command_writes_scene_table_and_figure(tmp_path: Path) -> None:
         ({"limits": {"tau.theta_1": [5.0, 6.0]}, "random": 2}, "none of 2 random motions .* exceeds tau.theta_1 by"),
         (
             {"noise": {"tau.theta_9": 1.0}},
-            "excite: noise: no quantity 'tau.theta_9'; expected tau.theta_1, tau.theta_3",
+            "excite: noise: no motor 'theta_9'; there are theta_1, theta_3",
         ),
-        ({"noise": {"tau.theta_1": 1.0}}, "excite: noise: tau.theta_3: expected a number above zero, got None"),
+        ({"noise": {"tau.theta_1": 1.0, "tau.theta_3": 0.0}}, "excite: noise: expected numbers above zero"),
+        ({"noise": {"tau.theta_1": 1.0}}, "excite: noise: theta_3 missing"),
     ],
 )
 def test_wrong_arguments_have_one_message(arguments: dict[str, object], message: str) -> None:
