@@ -323,7 +323,7 @@ def excite(
     Notes
     -----
     Sequential quadratic programming (SciPy's SLSQP) from the best random motion. The limits hold on a grid of
-    60 instants for each harmonic, five times finer than the one that is optimized.
+    80 instants for each harmonic, five times finer than the one that is optimized.
     """
     mechanism = as_mechanism(mechanism, "excite")
     mechanism.refuse_prescribed_joints("excite")
@@ -372,18 +372,20 @@ def _search(
         exceeded = ", ".join(f"{name} by {x:.3g}" for name, x in excess if x > 0)
         which = f"the closest one exceeds {exceeded}" if np.isfinite(closest.max()) else "the loops do not close"
         raise InputError(f"excite: limits: none of {count} random motions is within them; {which}")
-    _, x, start = best
+    score, x, start = best
     condition, log_det = np.array(values).T
     done = iter(range(count, 10**9))
     x, fine = problem.optimize(x, start, iterations, lambda: progress(min(next(done) + 1, total), total))
-    return _result(problem, parameters, x, fine, RandomMotions(
+    stuck = () if problem.score(fine.regressor) < score else ("the search found nothing better than a random motion",)
+    return _result(problem, parameters, x, fine, stuck, RandomMotions(
         count, len(values), (float(condition.min()), float(np.median(condition))),
         (float(log_det.max()), float(np.median(log_det)))))  # fmt: skip
 
 
 def _result(
-    problem: ExcitationProblem, parameters: tuple[str, ...], x: Array, fine: Instants, random: RandomMotions
-) -> Excitation:
+    problem: ExcitationProblem, parameters: tuple[str, ...], x: Array, fine: Instants, warnings: tuple[str, ...],
+    random: RandomMotions,
+) -> Excitation:  # fmt: skip
     limits, mechanism = problem.limits, problem.mechanism
     worst = limits.worst(fine.quantities)
     active = tuple(name for name, over in zip(limits.names, worst, strict=True) if over > -ACTIVE)
@@ -392,7 +394,7 @@ def _result(
     relative = fine.quantities[:, -2:].min(axis=0) / limits.scale[-2:]
     result = Excitation(
         mechanism, parameters, problem.period, x, condition, log_det, problem.basis.shape[1],
-        len(problem.regressor.unknowns), random, limits, extremes, active, float(relative.min()), problem.period, (),
+        len(problem.regressor.unknowns), random, limits, extremes, active, float(relative.min()), problem.period, warnings,
         problem, fine.motion.q_tree,
     )  # fmt: skip
     for k in range(MAX_RUN_IN_DOUBLINGS):
@@ -402,7 +404,13 @@ def _result(
         if worst.max() <= 0:
             return result
     exceeded = ", ".join(name for name, over in zip(limits.names, worst, strict=True) if over > 0)
-    return replace(result, warnings=(f"the run-in of {run_in:g} s exceeds the limits of {exceeded}",))
+    return replace(
+        result,
+        warnings=(
+            *warnings,
+            f"the run-in of {run_in:g} s exceeds the limits of {exceeded}",
+        ),
+    )
 
 
 def _require_driven(mechanism: Mechanism) -> None:
