@@ -376,7 +376,8 @@ def _search(
     condition, log_det = np.array(values).T
     done = iter(range(count, 10**9))
     x, fine = problem.optimize(x, start, iterations, lambda: progress(min(next(done) + 1, total), total))
-    stuck = () if problem.score(fine.regressor) < score else ("the search found nothing better than a random motion",)
+    is_better = problem.score(fine.regressor) < score
+    stuck = () if is_better else ("the search found nothing better than a random motion",)
     return _result(problem, parameters, x, fine, stuck, RandomMotions(
         count, len(values), (float(condition.min()), float(np.median(condition))),
         (float(log_det.max()), float(np.median(log_det)))))  # fmt: skip
@@ -400,17 +401,13 @@ def _result(
     for k in range(MAX_RUN_IN_DOUBLINGS):
         run_in = problem.period * 2**k
         result = replace(result, run_in=run_in)
-        worst = limits.worst(result._instants(np.arange(0.0, run_in, problem.period / len(fine.quantities))).quantities)
+        t = np.arange(0.0, run_in, problem.period / len(fine.quantities))
+        worst = limits.worst(result._instants(t).quantities)
         if worst.max() <= 0:
             return result
     exceeded = ", ".join(name for name, over in zip(limits.names, worst, strict=True) if over > 0)
-    return replace(
-        result,
-        warnings=(
-            *warnings,
-            f"the run-in of {run_in:g} s exceeds the limits of {exceeded}",
-        ),
-    )
+    message = f"the run-in of {run_in:g} s exceeds the limits of {exceeded}"
+    return replace(result, warnings=(*warnings, message))
 
 
 def _require_driven(mechanism: Mechanism) -> None:
