@@ -395,8 +395,8 @@ def _result(
     relative = fine.quantities[:, -2:].min(axis=0) / limits.scale[-2:]
     result = Excitation(
         mechanism, parameters, problem.period, x, condition, log_det, problem.basis.shape[1],
-        len(problem.regressor.unknowns), random, limits, extremes, active, float(relative.min()), problem.period, warnings,
-        problem, fine.motion.q_tree,
+        len(problem.regressor.unknowns), random, limits, extremes, active, float(relative.min()), problem.period,
+        warnings, problem, fine.motion.q_tree,
     )  # fmt: skip
     for k in range(MAX_RUN_IN_DOUBLINGS):
         run_in = problem.period * 2**k
