@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
     from ckc_pin.identification.calibration import Calibration, calibrate
+    from ckc_pin.identification.excitation import Excitation, excite
     from ckc_pin.identification.identify import Identification, identify
     from ckc_pin.kinematics import load
     from ckc_pin.kinematics.mapped import SingularityMap
@@ -79,6 +80,7 @@ __all__ = [
     "CkcError",
     "Controller",
     "Event",
+    "Excitation",
     "Explorer",
     "Floquet",
     "Force",
@@ -107,6 +109,7 @@ __all__ = [
     "calibrate",
     "check",
     "ensemble",
+    "excite",
     "explore",
     "floquet",
     "gain_locus",
@@ -133,6 +136,7 @@ MODULES = {
     "CkcError": "errors",
     "Controller": "control.controllers",
     "Event": "run.events",
+    "Excitation": "identification.excitation",
     "Explorer": "explorer.explore",
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
@@ -161,6 +165,7 @@ MODULES = {
     "calibrate": "identification.calibration",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
+    "excite": "identification.excitation",
     "explore": "explorer.explore",
     "floquet": "sensitivity.floquet",
     "gain_locus": "linear.locus",
@@ -257,6 +262,7 @@ def plot(
     | GainLocus
     | Sensitivities
     | MotionForces
+    | Excitation
     | SingularityMap
     | Identification
     | xarray.Dataset,
@@ -265,7 +271,7 @@ def plot(
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, Identification or Dataset
+    shown : Run, or one other result: LinearModel, GainLocus, Sensitivities, Identification, Dataset and so on
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
         The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
         map over two.

@@ -19,7 +19,8 @@ from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "estimate_motion", "fit_spline", "motion_from_states"]
+__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "fit_spline", "motion_along",
+           "motion_from_states"]  # fmt: skip
 
 DEGREE = 5
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
@@ -168,6 +169,22 @@ def _spline_std(spline: Any, t: Array) -> tuple[Array, Array]:
 def motion_from_states(mechanism: Mechanism, t: Array, q_tree: Array, v_tree: Array, a_tree: Array) -> MeasuredMotion:
     """Return an exact motion, such as that of a simulated run, given in the coordinates of the tree."""
     rho = np.array([mechanism.kinematics(q).rho for q in q_tree])
+    return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
+
+
+def close_many(mechanism: Mechanism, q_tree: Array, q: Array) -> Array:
+    """Return closed configurations (m, nq) with independent coordinates q (m, d), near others (InputError)."""
+    guess = np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
+    return _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d)).solve_many(guess, q)
+
+
+def motion_along(
+    mechanism: Mechanism, t: Array, q_tree: Array, q: Array, q_dot: Array, q_ddot: Array
+) -> MeasuredMotion:
+    """Return the exact motion with independent coordinates q (m, d), closed near q_tree (InputError)."""
+    nearest = _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d))
+    q_tree = close_many(mechanism, q_tree, q)
+    rho, v_tree, a_tree = nearest.rates(q_tree, q_dot, q_ddot)
     return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
 
 
