@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
+    from ckc_pin.identification.calibration import Calibration, calibrate
+    from ckc_pin.identification.excitation import Excitation, excite
     from ckc_pin.identification.identify import identify
     from ckc_pin.identification.result import Identification
     from ckc_pin.kinematics import load
@@ -74,10 +76,12 @@ if TYPE_CHECKING:
     from ckc_pin.view.server import ViewServer
 
 __all__ = [
+    "Calibration",
     "Check",
     "CkcError",
     "Controller",
     "Event",
+    "Excitation",
     "Explorer",
     "Floquet",
     "Force",
@@ -103,8 +107,10 @@ __all__ = [
     "Terms",
     "Tracking",
     "as_ivp",
+    "calibrate",
     "check",
     "ensemble",
+    "excite",
     "explore",
     "floquet",
     "gain_locus",
@@ -126,10 +132,12 @@ __version__ = "0.1.0"
 
 
 MODULES = {
+    "Calibration": "identification.calibration",
     "Check": "analysis.check",
     "CkcError": "errors",
     "Controller": "control.controllers",
     "Event": "run.events",
+    "Excitation": "identification.excitation",
     "Explorer": "explorer.explore",
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
@@ -155,8 +163,10 @@ MODULES = {
     "Terms": "dynamics.terms",
     "Tracking": "control.controllers",
     "as_ivp": "run.ivp",
+    "calibrate": "identification.calibration",
     "check": "analysis.check",
     "ensemble": "ensembles.ensemble",
+    "excite": "identification.excitation",
     "explore": "explorer.explore",
     "floquet": "sensitivity.floquet",
     "gain_locus": "linear.locus",
@@ -253,6 +263,7 @@ def plot(
     | GainLocus
     | Sensitivities
     | MotionForces
+    | Excitation
     | SingularityMap
     | Identification
     | xarray.Dataset,
@@ -261,7 +272,7 @@ def plot(
 
     Parameters
     ----------
-    shown : Run, or one LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, Identification or Dataset
+    shown : Run, or one other result: LinearModel, GainLocus, Sensitivities, Identification, Dataset and so on
         Runs of one mechanism under one kind of control share a figure. A linear model has figures of poles and modes.
         The Dataset of an `ensemble` has a figure for each output: quantiles over time, a line over one variable, or a
         map over two.

@@ -50,6 +50,7 @@ COMMANDS = {
     "linearize": "analyses:linearize",
     "sensitivities": "analyses:sensitivities",
     "sweep": "sweep:sweep",
+    "excite": "excite:excite",
     "identify": "identification:identify",
     "plot": "runs:plot",
     "play": "runs:play",

@@ -6,7 +6,8 @@ smaller than half of such a unit. Every other direction is left out of the solut
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +39,8 @@ class LinearFit(Immutable):
         Orthonormal basis of the determined directions.
     information : (r,) array
         Inverse standard deviations along these directions for independent residuals.
+    influence : (m, r, d) array
+        Derivatives of the solution along the determined directions with respect to the right-hand sides.
     residual : (m, d) array
     noise : (d, d) array
         Covariance of the residuals of one instant.
@@ -53,11 +56,17 @@ class LinearFit(Immutable):
     covariance: Array
     determined: Array
     information: Array
+    influence: Array
     residual: Array
     noise: Array
     correlation_time: int
     condition: float
     rank: int
+
+    def with_errors(self, errors: Sequence[Array]) -> LinearFit:
+        """Add errors that do not average out: steps (r, any) along the determined directions, of unit variance each."""
+        covariance = sum((self.determined @ x @ x.T @ self.determined.T for x in errors), self.covariance)
+        return replace(self, covariance=covariance)
 
     def combinations(self, tolerance: float) -> tuple[IntArray, Array]:
         """Return one unknown for each determined direction, and coefficients (r, p) of what is determined.
@@ -111,10 +120,15 @@ def fit_linear(
             np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and _ > 1
         ):
             break
-    return _solution(A, b, u, s, v, rank, residual, covariance if noise is None else noise.mean(axis=0))
+    return _solution(
+        A, b, u, s, v, rank, residual, covariance if noise is None else noise.mean(axis=0), whitening, weights
+    )
 
 
-def _solution(A: Array, b: Array, u: Array, s: Array, v: Array, rank: int, residual: Array, noise: Array) -> LinearFit:
+def _solution(
+    A: Array, b: Array, u: Array, s: Array, v: Array, rank: int, residual: Array, noise: Array, whitening: Array,
+    weights: Array,
+) -> LinearFit:  # fmt: skip
     """Keep the determined directions, and estimate the covariance of x."""
     p = A.shape[2]
     keep = int(np.sum(s[:rank] > 1.0 / MAX_STD))
@@ -131,8 +145,9 @@ def _solution(A: Array, b: Array, u: Array, s: Array, v: Array, rank: int, resid
             meat += (1 - k / (lag + 1)) * (product + product.T)
     inside = meat / np.outer(s[:keep] ** 2, s[:keep] ** 2)
     condition = float(s[0] / s[keep - 1]) if keep else float("inf")
-    return LinearFit(x, basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep], residual, noise, lag,
-                     condition, rank)  # fmt: skip
+    influence = ((A @ basis) * np.sqrt(weights)[:, None, None] / s[:keep] ** 2).swapaxes(1, 2) @ whitening
+    return LinearFit(x, basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep], influence, residual,
+                     noise, lag, condition, rank)  # fmt: skip
 
 
 def _correlation_time(residual: Array) -> int:

@@ -19,7 +19,8 @@ from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "estimate_motion", "estimate_start", "fit_spline", "motion_from_states"]
+__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_spline",
+           "motion_along", "motion_from_states"]  # fmt: skip
 
 DEGREE = 5
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
@@ -78,16 +79,30 @@ class SplineFit(Immutable):
         Standard deviations of the spline, its rate and its acceleration in the interior, root mean squares.
     interval : float
         Distance of two knots, s.
+    factor : (6, coefficients) array
+        Cholesky factor of the normal equations, as a band.
     """
 
     spline: Any
     noise: float
     std: Array
     interval: float
+    factor: Array
 
     def values(self, t: Array) -> Array:
         """Return value, rate and acceleration, shape (3, len(t))."""
         return np.array([self.spline(t), self.spline.derivative(1)(t), self.spline.derivative(2)(t)])
+
+    def acceleration_errors(self, t: Array, weights: Array) -> Array:
+        """Return sums of weights (m, r) times errors of the acceleration, (r, coefficients) of variance 1 each."""
+        from scipy.interpolate import BSpline
+        from scipy.linalg import solve_banded
+
+        by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(2)
+        design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - 2)
+        sums = (weights.T @ design) @ by_coefficient.c[: design.shape[1]]
+        lower = np.array([np.roll(row, -k) for k, row in enumerate(self.factor[::-1])])  # the transposed factor
+        return self.noise * solve_banded((DEGREE, 0), lower, sums.T).T
 
 
 def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
@@ -118,7 +133,8 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     if noise is None:
         noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
     interval = (t[-1] - t[0]) / (size - DEGREE)
-    return SplineFit(spline, noise, noise * _spline_std(spline, t), float(interval))
+    std, factor = _spline_std(spline, t)
+    return SplineFit(spline, noise, noise * std, float(interval), factor)
 
 
 def _least_squares(t: Array, y: Array, intervals: int) -> tuple[Any, int]:
@@ -130,8 +146,8 @@ def _least_squares(t: Array, y: Array, intervals: int) -> tuple[Any, int]:
     return make_lsq_spline(t, y, knots, k=DEGREE), intervals + DEGREE
 
 
-def _spline_std(spline: Any, t: Array) -> Array:
-    """Return the root mean square over time of the standard deviations for unit noise."""
+def _spline_std(spline: Any, t: Array) -> tuple[Array, Array]:
+    """Return the standard deviations of `SplineFit` for unit noise, and its factor."""
     from scipy.interpolate import BSpline
     from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -146,12 +162,29 @@ def _spline_std(spline: Any, t: Array) -> Array:
     at = np.linspace(t[0], t[-1], 25)[2:-2]
     unit = BSpline(knots, np.eye(size), DEGREE)
     rows = [unit(at), unit.derivative(1)(at), unit.derivative(2)(at)]
-    return np.sqrt([np.mean(np.sum(x.T * cho_solve_banded((factor, False), x.T), axis=0)) for x in rows])
+    std = np.sqrt([np.mean(np.sum(x.T * cho_solve_banded((factor, False), x.T), axis=0)) for x in rows])
+    return std, factor
 
 
 def motion_from_states(mechanism: Mechanism, t: Array, q_tree: Array, v_tree: Array, a_tree: Array) -> MeasuredMotion:
     """Return an exact motion, such as that of a simulated run, given in the coordinates of the tree."""
     rho = np.array([mechanism.kinematics(q).rho for q in q_tree])
+    return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
+
+
+def close_many(mechanism: Mechanism, q_tree: Array, q: Array) -> Array:
+    """Return closed configurations (m, nq) with independent coordinates q (m, d), near others (InputError)."""
+    guess = np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
+    return _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d)).solve_many(guess, q)
+
+
+def motion_along(
+    mechanism: Mechanism, t: Array, q_tree: Array, q: Array, q_dot: Array, q_ddot: Array
+) -> MeasuredMotion:
+    """Return the exact motion with independent coordinates q (m, d), closed near q_tree (InputError)."""
+    nearest = _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d))
+    q_tree = close_many(mechanism, q_tree, q)
+    rho, v_tree, a_tree = nearest.rates(q_tree, q_dot, q_ddot)
     return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
 
 

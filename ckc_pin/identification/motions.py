@@ -189,6 +189,11 @@ def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _
             f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torques of "
             f"all motors or of none are needed, there are {', '.join(record.values) or 'none'}"
         )
+    estimated = next((name for name, delay in record.delay.items() if isinstance(delay, str)), None)
+    if estimated is not None:
+        raise InputError(
+            f'identify: {record.source}: delay: {estimated}: method = "torques" estimates delays; give the delay in s'
+        )
     if missing:
         warnings.append(f"{record.source}: no torques were recorded, so the motors count as unpowered")
     require_radians(mechanism, record, coordinates)

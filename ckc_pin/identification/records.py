@@ -13,6 +13,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.base.validation import suggest_name
 from ckc_pin.errors import InputError
+from ckc_pin.identification.bags import is_bag, read_bag
 from ckc_pin.identification.spec import UNITS, DataSpec
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.columns import list_quantities
@@ -38,7 +39,7 @@ class Record(Immutable):
         By quantity, in SI units; NaN marks gaps.
     noise : mapping of str to float
         Standard deviations that are known.
-    delay : mapping of str to float
+    delay : mapping of str to float or "estimate"
         s.
     validation : bool
     """
@@ -47,12 +48,13 @@ class Record(Immutable):
     t: Array
     values: Mapping[str, Array]
     noise: Mapping[str, float] = field(default_factory=dict)
-    delay: Mapping[str, float] = field(default_factory=dict)
+    delay: Mapping[str, float | str] = field(default_factory=dict)
     validation: bool = False
 
     def times(self, quantity: str) -> Array:
         """Return the times at which the values of a quantity happened, s."""
-        return self.t - self.delay.get(quantity, 0.0)
+        delay = self.delay.get(quantity, 0.0)
+        return self.t - (0.0 if isinstance(delay, str) else delay)
 
 
 def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, folder: Path | None = None) -> Record:
@@ -127,6 +129,8 @@ def _read_file(path: Path) -> dict[str, Array]:
             raise InputError(f"{path}: larger than {MAX_BYTES / 1e9:.0f} GB; give a part of the recording")
         if path.suffix == ".parquet":
             return _read_parquet(path)
+        if is_bag(path):
+            return read_bag(path)
         with path.open(encoding="utf-8", newline="") as file:
             names = [name.strip() for name in next(csv.reader(file), [])]
             numbers = np.genfromtxt(file, delimiter=",", dtype=float)

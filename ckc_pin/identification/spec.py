@@ -29,8 +29,9 @@ class DataSpec(_Spec, frozen=True):
     Attributes
     ----------
     file
-        A CSV or Parquet file in the folder of this one. Its columns are ``t`` and quantities by name: coordinates,
-        ``v.COORDINATE``, ``tau.MOTOR``, and points as ``tip.x``. An empty field is a gap.
+        A CSV or Parquet file, or a recording of ROS (MCAP, rosbag2), in the folder of this one. Its columns are ``t``
+        and quantities by name: coordinates, ``v.COORDINATE``, ``tau.MOTOR``, and points as ``tip.x``. An empty field is
+        a gap.
         ``file = "swing.csv"``
     noise : the quantity's
         Standard deviations of measurements by quantity; estimated for the others.
@@ -42,7 +43,8 @@ class DataSpec(_Spec, frozen=True):
         Units by quantity, if they are not SI: deg, mm, ms, rpm and others.
         ``units = {theta_1 = "deg", t = "ms"}``
     delay : s
-        Delays of quantities: how much later than it happened a value was recorded.
+        Delays of quantities: how much later than it happened a value was recorded. ``"estimate"`` for torques finds one
+        delay of all torques, of up to 0.05 s.
         ``delay = {"tau.theta_1" = 0.002}``
     span : s
         First and last time that are used.
@@ -56,7 +58,7 @@ class DataSpec(_Spec, frozen=True):
     noise: dict[str, PositiveFloat] = {}
     names: dict[str, str] = {}
     units: dict[str, str] = {}
-    delay: dict[str, float] = {}
+    delay: dict[str, float | Literal["estimate"]] = {}
     span: tuple[float, float] | None = None
     validation: bool = False
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import LinearFit, fit_linear
-from ckc_pin.identification.measured_motion import MeasuredMotion, estimate_motion, fit_spline
+from ckc_pin.identification.measured_motion import MeasuredMotion, SplineFit, estimate_motion, fit_spline
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
@@ -20,6 +20,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 __all__ = ["identify_torques"]
 
 MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
+MAX_DELAY, DELAY_GRID, MAX_DELAY_INSTANTS = 0.05, 21, 1000  # s; delays that are tried, with so many instants
 LEAK_TOLERANCE = 1e-6  # part of a gradient in directions that are not determined
 SATURATED = 0.999  # of a torque limit
 MAX_SATURATED = 0.5  # share of instants
@@ -37,6 +38,8 @@ class _Equations:
     to_motors : (m, motors, d) array
         Torques that give generalized forces, least-squares.
     tau : (m, motors) array
+    fits : mapping of str to SplineFit
+        By measured coordinate.
     """
 
     record: Record
@@ -45,6 +48,7 @@ class _Equations:
     right: Array
     to_motors: Array
     tau: Array
+    fits: Mapping[str, SplineFit]
 
 
 def identify_torques(
@@ -54,6 +58,7 @@ def identify_torques(
     regressor = TorqueRegressor(mechanism, parameters)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
+        records = [_with_delay(mechanism, regressor, record, warnings) for record in records]
         equations = [_equations(mechanism, regressor, record, warnings) for record in records]
         fitted = [x for x in equations if not x.record.validation]
         columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
@@ -63,6 +68,10 @@ def identify_torques(
                 "less"
             )
         fit = fit_linear(columns, right, robust=robust)
+        parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
+        fit = fit.with_errors(
+            [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
+        )
         step = fit.x
         if physical:
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
@@ -73,7 +82,13 @@ def identify_torques(
     )  # fmt: skip
 
 
-def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> _Equations:
+def _equations(
+    mechanism: Mechanism,
+    regressor: TorqueRegressor,
+    record: Record,
+    warnings: list[str],
+    max_instants: int = MAX_INSTANTS,
+) -> _Equations:
     """Estimate the motion of a record, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
@@ -98,14 +113,52 @@ def _equations(mechanism: Mechanism, regressor: TorqueRegressor, record: Record,
     if saturated.any():
         warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
     at = np.flatnonzero(used & ~saturated)
-    at = at[:: max(1, -(-len(at) // MAX_INSTANTS))]
+    at = at[:: max(1, -(-len(at) // max_instants))]
     first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
     motion, _ = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
     columns, force = regressor.rows(motion)
     to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
     right = np.einsum("kdm,km->kd", to_forces, tau) - force
-    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau)
+    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau, fits)
+
+
+def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> Record:
+    """Return the record with the delay of its torques that leaves the smallest residual, if it is to be estimated."""
+    from scipy.optimize import minimize_scalar
+
+    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
+    if not any(isinstance(record.delay.get(name), str) for name in torques):
+        return record
+
+    def delayed(delay: float) -> Record:
+        return replace(record, delay={**record.delay, **dict.fromkeys(torques, delay)})
+
+    def residual(delay: float) -> float:
+        equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS)
+        off = fit_linear(equations.columns, equations.right).residual
+        return float(np.log(np.mean(off**2, axis=0) + 1e-300).sum())
+
+    grid = np.linspace(-MAX_DELAY, MAX_DELAY, DELAY_GRID)
+    best = grid[int(np.argmin([residual(delay) for delay in grid]))]
+    step = grid[1] - grid[0]
+    minimum = minimize_scalar(residual, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-6})
+    warnings.append(f"{record.source}: the torques are {1e3 * minimum.x:.4g} ms late, estimated from their residuals")
+    return delayed(float(minimum.x))
+
+
+def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
+    """Return the steps of the solution (r, any) that errors of the accelerations cause, of unit variance each.
+
+    They are correlated over a knot interval and too small beside the noise of torques to show in the residuals. The
+    inertia that turns them into torques is that of the start values.
+    """
+    motion = equations.motion
+    at = mechanism.tree.indices(tuple(equations.fits), "identify")
+    D_tree = np.array([mechanism.tree.mass_matrix(q) for q in motion.q_tree])
+    by_coordinate = D_tree @ motion.rho @ np.linalg.pinv(motion.rho[:, at])
+    steps = influence @ (motion.rho.swapaxes(1, 2) @ by_coordinate)  # (m, r, coordinates)
+    return [fit.acceleration_errors(motion.t, steps[:, :, k]) for k, fit in enumerate(equations.fits.values())]
 
 
 def _prediction(equations: _Equations, motors: Sequence[str], step: Array, fit: LinearFit) -> Prediction:

@@ -18,7 +18,7 @@ from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["ManyPoses", "difference_many", "evaluate_closure", "integrate_many", "join_closures"]
+__all__ = ["ManyPoses", "difference_many", "evaluate_closure", "evaluate_group", "integrate_many", "join_closures"]
 
 Renumber = Callable[[IntArray], IntArray]
 
@@ -45,11 +45,12 @@ def evaluate_closure(tree: Tree, closure: Closure, q_tree: Array) -> tuple[Array
         part = slice(start, start + CHUNK)
         pose = ManyPoses(tree, closure.anchors, q_tree[part])
         for group in closure.groups:
-            phi[part, group.out], jacobian[part, group.out] = _evaluate(group, closure, pose)
+            phi[part, group.out], jacobian[part, group.out] = evaluate_group(group, closure, pose)
     return phi, jacobian
 
 
-def _evaluate(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Array]:
+def evaluate_group(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Array]:
+    """Return the residual (count, rows) of one group of rows, and its Jacobian (count, rows, columns)."""
     if isinstance(group, Affine):
         phi = pose.configurations[:, pose.tree.q_index] @ group.matrix.T - group.offset
         jacobian = np.broadcast_to(group.matrix, (pose.count, *group.matrix.shape))
@@ -60,7 +61,7 @@ def _evaluate(group: Rows, closure: Closure, pose: ManyPoses) -> tuple[Array, Ar
         return phi, jacobian
     copies = _repeat(group, closure, pose)
     shape = (pose.count, len(group.out))
-    return copies.phi(pose).reshape(shape), copies.jacobian(pose).reshape(*shape, pose.tree.n)
+    return copies.phi(pose).reshape(shape), copies.jacobian(pose).reshape(*shape, pose.columns)
 
 
 def _repeat(group: Rows, closure: Closure, pose: ManyPoses) -> Rows:
@@ -79,7 +80,7 @@ def _repeat(group: Rows, closure: Closure, pose: ManyPoses) -> Rows:
     if isinstance(repeated, Distance):
         return replace(repeated, length=np.tile(repeated.length, count))
     if isinstance(repeated, RelativeLog):
-        renumber_joint = offset_by(pose.tree.model.njoints)
+        renumber_joint = offset_by(pose.bodies)
         return replace(
             repeated,
             joint_a=renumber_joint(repeated.joint_a),
@@ -147,10 +148,16 @@ class ManyPoses(Pose):
     tree : Tree
     anchors : Anchors
     configurations : (count, nq) array
+
+    Attributes
+    ----------
+    bodies, columns : int
+        Number of bodies that anchors may refer to, the joints, and of columns of the Jacobians.
     """
 
     def __init__(self, tree: Tree, anchors: Anchors, configurations: Array) -> None:
         self.tree = tree
+        self.bodies, self.columns = tree.model.njoints, tree.n
         self.anchors = anchors
         self.configurations = configurations
         self.count = len(configurations)
@@ -161,7 +168,7 @@ class ManyPoses(Pose):
         self.angular_part = jacobian[:, 3:]
 
     def _joints(self, joint: IntArray) -> IntArray:
-        return (np.arange(self.count)[:, None] * self.tree.model.njoints + joint).ravel()
+        return (np.arange(self.count)[:, None] * self.bodies + joint).ravel()
 
     @lazy
     def p(self) -> Array:
@@ -189,7 +196,7 @@ class ManyPoses(Pose):
     def r_jacobian(self) -> Array:
         """Jacobians of the differences, shape (count * k, 3, n)."""
         k = self.p.shape[1] // 2
-        return (self.p_jacobian[:, :k] - self.p_jacobian[:, k:]).reshape(-1, 3, self.tree.n)
+        return (self.p_jacobian[:, :k] - self.p_jacobian[:, k:]).reshape(-1, 3, self.columns)
 
     @lazy
     def e(self) -> Array:
@@ -205,5 +212,5 @@ class ManyPoses(Pose):
 
     def angular(self, joint: IntArray) -> Array:
         """Angular Jacobians of joints, which are numbered across all copies, shape (len(joint), 3, n)."""
-        copy, number = np.divmod(joint, self.tree.model.njoints)
+        copy, number = np.divmod(joint, self.bodies)
         return self.tree.support[number] * self.angular_part[copy]

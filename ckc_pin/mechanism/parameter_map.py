@@ -154,10 +154,14 @@ class ParameterMap:
 
     def derivative(self, name: str) -> dict[str, Array]:
         """Return the derivatives of all numbers that depend on a single parameter, shapes as of the numbers."""
-        value = np.array([[self.value_of(name) + 1j * COMPLEX_STEP]])
-        numbers, _ = self.evaluate([name], value)
-        slopes = {key: _clean(x[0].imag / COMPLEX_STEP) for key, x in numbers.items()}
-        return {key: slope for key, slope in slopes.items() if slope.any()}
+        _, slopes = self.linearize([name], np.array([self.value_of(name)]))
+        return {key: slope[0] for key, slope in slopes.items() if slope.any()}
+
+    def linearize(self, names: Sequence[str], values: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return the numbers that depend on single parameters, and their derivatives (names, ...), at other values."""
+        numbers, _ = self.evaluate(names, values + 1j * COMPLEX_STEP * np.eye(len(names)))
+        slopes = {key: np.array([_clean(slope) for slope in x.imag / COMPLEX_STEP]) for key, x in numbers.items()}
+        return {key: x[0].real for key, x in numbers.items()}, slopes
 
     def reproduces(self, names: Sequence[str]) -> bool:
         """Whether the mechanism's own values give its own numbers up to rounding."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ckc_pin.errors import InputError
+from ckc_pin.identification.excitation import Excitation
 from ckc_pin.identification.result import Identification
 from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.linear.linear_model import LinearModel
@@ -25,21 +26,29 @@ from ckc_pin.view.identification_figures import draw_identification
 from ckc_pin.view.linear_figures import draw_linear
 from ckc_pin.view.map_figures import draw_map
 from ckc_pin.view.player import render_html, write_page
-from ckc_pin.view.result_figures import draw_motion_forces, draw_sensitivities
+from ckc_pin.view.result_figures import draw_excitation, draw_motion_forces, draw_sensitivities
 
 if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
     Drawable = (
-        Run | LinearModel | GainLocus | Sensitivities | MotionForces | SingularityMap | Identification | xarray.Dataset
+        Run
+        | LinearModel
+        | GainLocus
+        | Sensitivities
+        | MotionForces
+        | Excitation
+        | SingularityMap
+        | Identification
+        | xarray.Dataset
     )
 
 __all__ = ["Figures", "Playback"]
 
 PLAYBACK_HEIGHT_PX = 480
 FIGURE_DPI = 100
-DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, SingularityMap, Identification)
+DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap, Identification)
 
 
 class Figures(Mapping[str, "Figure"]):
@@ -48,7 +57,6 @@ class Figures(Mapping[str, "Figure"]):
     Parameters
     ----------
     results : sequence of Run, or of one other result that `ckc_pin.plot` takes
-        of an ensemble
 
     Raises
     ------
@@ -66,6 +74,8 @@ class Figures(Mapping[str, "Figure"]):
                 self._figures = {"inverse": draw_motion_forces(result)}
             case [Identification() as result]:
                 self._figures = draw_identification(result)
+            case [Excitation() as result]:
+                self._figures = {"excite": draw_excitation(result)}
             case [SingularityMap() as result]:
                 self._figures = {f"map_{result.space}": draw_map(result)}
             case [result] if _is_dataset(result):

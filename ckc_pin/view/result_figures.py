@@ -1,4 +1,4 @@
-"""Figures of inverse dynamics, of sensitivities along a run, and of work-precision comparisons."""
+"""Figures of inverse dynamics, of exciting motions, of sensitivities along a run, and of work-precision comparisons."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
+from ckc_pin.identification.excitation import Excitation
 from ckc_pin.mechanism.units import joined, motor_units
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.motion_forces import MotionForces
@@ -20,10 +22,11 @@ from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, f
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces", "save_precision",
-           "save_sensitivities"]  # fmt: skip
+__all__ = ["draw_excitation", "draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces",
+           "save_precision", "save_sensitivities"]  # fmt: skip
 
 MAX_NOTE_MOTORS = 3  # named in a note; longer notes exceed the panel
+MAX_EXCITATION_ROWS = 1000
 MAX_PARAMETERS = 6  # panels of a figure of sensitivities
 MAX_LEGEND_CURVES = 12  # of a figure of sensitivities
 MIN_ERROR = 1e-16  # smaller errors are drawn there, because zero has no logarithm
@@ -103,6 +106,48 @@ def _finish_axes(ax: Any, named_colours: dict[str, str], count: int) -> None:
     if count > len(named_colours):
         handles.append(legend_line(style.REST_COLOUR, f"{count - len(named_colours)} more"))
     fit_legend(ax, handles)
+
+
+# --- excitation ----------------------------------------------------------------------------------
+
+
+def draw_excitation(excitation: Excitation) -> Figure:
+    """Return the figure of run-in and period: independent coordinates, and motor torques with their limits below.
+
+    Raises
+    ------
+    InputError
+        matplotlib is not installed.
+    """
+    mechanism = excitation.mechanism
+    t = excitation.sample_times(MAX_EXCITATION_ROWS / (excitation.run_in + excitation.period))
+    columns = excitation.quantities(t)
+    bounds = dict(zip(excitation.limits.names, zip(excitation.limits.lower, excitation.limits.upper, strict=True),
+                      strict=True))  # fmt: skip
+    with figure_style():
+        title = f"{escape_mathtext(mechanism.name)}: condition number {excitation.condition:.3g}"
+        best = f"best of {excitation.random.count} random motions: {excitation.random.condition[0]:.3g}; dashed: limits"
+        slots = create_page(title, best, ["motion", "motors"], 1, (style.WIDTH_IN, 2.4))
+        coordinate_units = dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
+        panels = ((mechanism.independent, "", "$q$", [coordinate_units[name] for name in mechanism.independent]),
+                  (mechanism.motors.names, "tau.", r"$\tau$", motor_units(mechanism)))  # fmt: skip
+        for slot, (names, prefix, symbol, units) in zip(slots, panels, strict=True):
+            named = style.select_largest({name: float(np.abs(columns[prefix + name]).max()) for name in names})
+            colours = style.assign_colours(named)
+            axes = slot.add_axes(len(set(units)))
+            for ax, unit in zip(axes, dict.fromkeys(units), strict=True):
+                for name in (name for name, other in zip(names, units, strict=True) if other == unit):
+                    _draw_between(ax, t, columns[prefix + name], bounds[prefix + name], colours.get(name))
+                ax.set_ylabel(axis_label(symbol, unit))
+            _finish_axes(axes[-1], {coordinate_symbol(name): colours[name] for name in named}, len(names))
+        return slots[0].figure
+
+
+def _draw_between(ax: Any, t: Array, curve: Array, limits: tuple[float, float], colour: str | None) -> None:
+    ax.plot(t, curve, color=colour or style.REST_COLOUR)
+    for limit in limits:
+        if np.isfinite(limit):
+            ax.axhline(limit, color=colour or style.GREY, linestyle="--", linewidth=0.9)
 
 
 # --- sensitivities -------------------------------------------------------------------------------

@@ -169,6 +169,12 @@ def benchmark(
         list[str] | None,
         typer.Option(metavar="COMMAND", help="a program to add, as docs/report/peers.md explains; repeatable"),
     ] = None,
+    archive: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="measure nothing: pack the tables with checksums as a zip file")
+    ] = None,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="first install programs that need an environment of their own")
+    ] = False,
 ) -> None:
     """Measure error against run time, here and in other programs.
 
@@ -179,8 +185,27 @@ def benchmark(
 
     if page and peer:
         raise typer.BadParameter("--page measures nothing, so it adds no --peer; leave one of them out")
+    if archive:
+        from scripts.experiments.benchmark.archive import pack
+
+        print(f"written: {pack(out or DOCS / 'report', archive)}")
+        return
+    if peers:
+        from scripts.experiments.benchmark.peers.environments import PROGRAMS, make_environment
+
+        for program in PROGRAMS:
+            print(make_environment(program), flush=True)
     folder = out or (Path("out/report") if peer else DOCS / "report")
     for path in make.report(folder, quick=quick, from_tables=page, added=add_programs(peer or ())):
+        print(f"written: {path}")
+
+
+@app.command(epilog=examples("iftomm", "iftomm --out out/iftomm"))
+def iftomm(out: Annotated[Path, typer.Option(metavar="DIR", help="gets the files")] = Path("out/iftomm")) -> None:
+    """Write problems A01 to A05 of IFToMM's library in its result format."""
+    from scripts.experiments.benchmark.iftomm import write_solutions
+
+    for path in write_solutions(out):
         print(f"written: {path}")
 
 

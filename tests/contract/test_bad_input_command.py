@@ -25,7 +25,7 @@ CASES = [
         ["rnu"],
         [
             "No such command 'rnu'",
-            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, identify, plot, play",
+            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify, plot,",
         ],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
@@ -72,6 +72,16 @@ CASES = [
     Bad("scene as mechanism", [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"], ["unknown key 'mechanism'"]),
     Bad("a name that no file can have", ["check", "\0.toml"], [r"'\x00.toml'", "not a valid file name"]),
     Bad("a name too long for a file", ["check", "x" * 5000 + ".toml"], ["xx.toml: cannot be read: File name too"]),
+    # exciting motions
+    Bad(
+        "period of zero",
+        ["excite", "five_bar", "--period", "0"],
+        ["excite: period: expected a number of seconds above"],
+    ),
+    Bad("no parameters", ["excite", "five_bar", "--parameters", ","], ["excite: parameters: nothing to identify"]),
+    Bad("no rate", ["excite", "five_bar", "--rate", "0"], ["--rate 0: expected a number above zero"]),
+    Bad("unknown limit", ["excite", "five_bar", "--limit", "v.x=1"], ["excite: limits: v.x: no such quantity"]),
+    Bad("limit without value", ["excite", "five_bar", "--limit", "v.theta_1"], ["--limit v.theta_1: write KEY=VALUE"]),
     # the state of terms
     Bad("state that is not JSON", [*TERMS, "theta_1=1"], ["--q theta_1=1: not JSON", "--q '{\"theta_1\": 0.4}'"]),
     Bad("state without end", [*TERMS, "[" * 100_000], ["--q [[", "not JSON"]),

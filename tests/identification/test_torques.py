@@ -188,6 +188,54 @@ def test_offsets_gaps_units_and_delays():
     assert result.instants < 905
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_recording_of_ros_gives_the_columns_of_its_joint_states(tmp_path, storage):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from ckc_pin.identification.records import read_record
+    from ckc_pin.identification.spec import DataSpec
+
+    data = {name: x[:40] for name, x in record("five_bar").items()}
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as bag:
+        topic = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=store)
+        tracker = bag.add_connection("/tip", "geometry_msgs/msg/Point", typestore=store)
+        for k, t in enumerate(data["t"]):
+            nanoseconds = round(1e9 * t) + 1_700_000_000_000_000_000
+            stamp = types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 1_000_000_000))
+            header = types["std_msgs/msg/Header"](stamp, "base")
+            position, effort = (np.array([data[f"{prefix}theta_{i}"][k] for i in (1, 3)]) for prefix in ("", "tau."))
+            state = types["sensor_msgs/msg/JointState"](header, ["theta_1", "theta_3"], position, 0 * position, effort)
+            raw = store.serialize_cdr(state, "sensor_msgs/msg/JointState")
+            bag.write(topic, nanoseconds + 5, bytes(raw))  # logged later than it was measured
+            point = types["geometry_msgs/msg/Point"](float(k), 2.0, 3.0)
+            bag.write(tracker, nanoseconds, bytes(store.serialize_cdr(point, "geometry_msgs/msg/Point")))
+    path = next(tmp_path.glob("bag/*.mcap")) if storage == "mcap" else tmp_path / "bag"
+    spec = DataSpec(file="bag", names={"v.theta_2": "/tip.x"})
+    read = read_record(path, load("five_bar"), spec)
+    np.testing.assert_allclose(read.t, data["t"] - data["t"][0], atol=1e-9)
+    for name in ("theta_1", "theta_3", "tau.theta_1", "tau.theta_3"):
+        np.testing.assert_array_equal(read.values[name], data[name])
+    np.testing.assert_array_equal(read.values["v.theta_2"], np.arange(40.0))
+
+
+def test_delay_of_torques_is_estimated():
+    from ckc_pin.identification.records import Record
+
+    data = record("five_bar", 1e-5, 0.01)
+    late = {name: np.interp(data["t"] - 0.0073, data["t"], x) if "tau" in name else x for name, x in data.items()}
+    values = {name: x for name, x in late.items() if name != "t"}
+    delay = {"tau.theta_1": "estimate"}
+    mechanism = load("five_bar")
+    result = identify_torques(
+        mechanism, [Record("late", data["t"], values, {}, delay)], PARAMETERS, physical=False, robust=False
+    )
+    assert float(result.warnings[0].split("the torques are ")[1].split(" ms")[0]) == pytest.approx(7.3, abs=0.3)
+
+
 def test_number_of_base_parameters_equals_the_rank_of_an_independent_regressor():
     """Pinocchio's regressor, projected on a null space of differences of the closure."""
     import pinocchio as pin

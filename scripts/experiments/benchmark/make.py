@@ -140,7 +140,7 @@ def _available_works(quick: bool) -> tuple[list[Work], dict[str, str]]:
 def rows_of(work: Work, quick: bool, memory: Memory, others: Sequence[Peer], budget: Budget = BUDGET) -> Iterator[Row]:
     """Measure a work with ckc_pin, then with the other programs.
 
-    A setting that exceeded its budget at one tolerance is not tried with a tighter one.
+    A setting that exceeded its budget at one tolerance or step is not tried with a smaller one.
     """
     run = memory.cache(_run, ignore=["work", "peer", "exact"])
     key, exact = work_stamp(work), exact_of(work, memory)
@@ -157,10 +157,19 @@ def rows_of(work: Work, quick: bool, memory: Memory, others: Sequence[Peer], bud
             spent[setting.family] = f"not tried: at rtol {setting.rtol:.0e} the {row.reason}"
         yield row
     for peer in others:
-        if peer.missing(work) is None:
-            key = work_stamp(work, peer.version())
-            for setting_name in peer.settings(work, quick):
-                yield run(key, peer.name, setting_name, budget.peer, work, peer, exact)
+        if peer.missing(work) is not None:
+            continue
+        key, too_slow = work_stamp(work, peer.version()), dict[str, str]()
+        for setting_name in peer.settings(work, quick):
+            family = setting_name.rpartition(", ")[0]
+            if family in too_slow:
+                motion = motion_without_data("refused", too_slow[family])
+                yield compare_with_reference(work, peer.name, setting_name, motion, exact())
+                continue
+            row = run(key, peer.name, setting_name, budget.peer, work, peer, exact)
+            if row.status == "refused":
+                too_slow[family] = f"not tried: {setting_name} {row.reason}"
+            yield row
 
 
 def exact_of(work: Work, memory: Memory) -> Callable[[], Reference]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import Scene, load_scene
+from scripts.experiments.benchmark.mechanisms import parallel_chains, pendulum
 
 __all__ = ["WORKS", "Budget", "Work"]
 
@@ -38,7 +39,8 @@ class Work:
     key : str
     says : str
         Title in a few words.
-    scene : str
+    scene : str or callable
+        Name of a shipped scene, or a function that makes one.
     t_end : float
         s.
     overrides : mapping
@@ -49,23 +51,36 @@ class Work:
         Whether it is part of the quick report.
     planar : bool
         Whether everything moves in one plane.
+    tight : float
+        Relative tolerance of the reference. Long chains have rounding errors above the smallest tolerances.
     """
 
     key: str
     says: str
-    scene: str
+    scene: str | Callable[[], Scene]
     t_end: float
     overrides: Mapping[str, Any] = field(default_factory=dict)
     point: str | None = None
     quick: bool = False
     planar: bool = True
+    tight: float = 1e-13
 
     def load(self, **solver: Any) -> Scene:
         """Return the scene, with values of its solver and formulation: load(formulation="dae", solver__rtol=1e-6)."""
-        overrides = {name.replace("__", "."): value for name, value in solver.items()}
-        return load_scene(
-            self.scene, {**self.overrides, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS, **overrides}
+        overrides = {
+            **self.overrides, "t_end": self.t_end, "solver.output_dt": self.t_end / INSTANTS,
+            **{name.replace("__", "."): value for name, value in solver.items()},
+        }  # fmt: skip
+        return (
+            load_scene(self.scene, overrides)
+            if isinstance(self.scene, str)
+            else self._python_scene.with_overrides(overrides)
         )
+
+    @cached_property
+    def _python_scene(self) -> Scene:
+        assert callable(self.scene)
+        return self.scene()
 
     @cached_property
     def mechanism(self) -> Mechanism:
@@ -114,6 +129,12 @@ def _tracking(epsilon: float, quick: bool = False) -> Work:
     return Work(f"tracking_{epsilon:.0e}", says, "five_bar/tracking", 9.5, {"epsilon": epsilon}, quick=quick)
 
 
+def _chains(depth: int, loop_size: int, t_end: float, *, quick: bool = False, tight: float = 1e-13) -> Work:
+    says = f"generalized_rbda's chains, depth {depth}, loop size {loop_size}, {t_end:g} s"
+    scene = partial(parallel_chains, depth, loop_size)
+    return Work(f"chains_{depth}_{loop_size}", says, scene, t_end, quick=quick, tight=tight)
+
+
 WORKS = (
     Work("swing", "five-bar, free swing, 2 s", "five_bar/swing", 2.0, quick=True),
     Work("swing_20", "five-bar, free swing, 20 s", "five_bar/swing", 20.0),
@@ -122,12 +143,18 @@ WORKS = (
     _tracking(1e-8),
     Work("set_point", "five-bar, set-point control, 9.5 s", "five_bar/set_point", 9.5),
     Work("andrews", "Andrews' squeezer, 0.05 s", "andrews", 0.05, quick=True),
+    Work("pendulum", "pendulum, 10 s", pendulum, 10.0, point="P1"),
     _n_four_bar(1),
+    _n_four_bar(2),
     _n_four_bar(4, quick=True),
     _n_four_bar(16),
     _n_four_bar(40),
     Work("bricard", "Bricard's six-bar, 10 s", "bricard", 10.0, planar=False),
+    Work("flyball", "stiff flyball governor, 10 s", "flyball", 10.0, planar=False),
     Work("slider_crank", "slider-crank, 5 s", "slider_crank", 5.0),
     Work("delta", "Delta, let go, 5 s", "delta", 5.0, planar=False),
     Work("two_ur5", "two UR5 on one bar, let go, 2 s", "two_ur5", 2.0, planar=False),
+    _chains(5, 5, 1.0, quick=True),
+    _chains(10, 9, 1.0),
+    _chains(40, 17, 0.5, tight=1e-9),
 )

@@ -15,7 +15,8 @@ from scipy.optimize import brentq
 
 from ckc_pin.errors import InputError
 from scripts.experiments.benchmark.peer_table import print_table
-from scripts.experiments.benchmark.peers import compiled, protocol
+from scripts.experiments.benchmark.peers import compiled, environments, protocol
+from scripts.experiments.benchmark.peers.environments import Program, find_python, make_environment
 from scripts.experiments.benchmark.peers.protocol import ProgramPeer, add_programs, make_problem
 from scripts.experiments.benchmark.work import WORKS, Work
 from tests.analytic.five_bar import FIVE_BAR, Q
@@ -218,3 +219,43 @@ def test_loops_that_points_cannot_express_have_no_pairs() -> None:
         json.dumps(problem, allow_nan=False)
         checked += 1
     assert checked > 5
+
+
+# --- environments --------------------------------------------------------------------------------------------------
+
+
+def test_this_python_is_found_by_its_version() -> None:
+    version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    assert find_python(version) == sys.executable
+    assert find_python("2.9") is None
+
+
+def test_missing_python_and_package_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(environments, "ENVIRONMENTS", tmp_path)
+    absent = Program("Drake", "drake_peer.py", "2.9", ("drake==9.9",))
+    assert make_environment(absent) == (
+        "Drake: drake==9.9 needs Python 2.9, which was not found on PATH, by pyenv or by uv; it is left out"
+    )
+    assert absent.command is None
+
+
+def test_environment_runs_a_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The requirement is there already, so that nothing is downloaded."""
+    (tmp_path / "echo.py").write_text(f"print({INTRODUCTION!r})\n", encoding="utf-8")
+    monkeypatch.setattr(environments, "ENVIRONMENTS", tmp_path / "some folder")
+    monkeypatch.setattr(environments, "SOURCES", tmp_path)
+    mine = Program("mine", "echo.py", f"{sys.version_info[0]}.{sys.version_info[1]}", ("pip",))
+    assert "installed in" in make_environment(mine)
+    assert make_environment(mine) == "mine: installed"
+    assert ProgramPeer(str(mine.command), mine.name).version() == "2"
+
+
+def test_programs_without_environment_are_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(environments, "ENVIRONMENTS", tmp_path)
+    environments.program_peers.cache_clear()
+    peers = environments.program_peers()
+    environments.program_peers.cache_clear()
+    assert [peer.name for peer in peers] == [program.name for program in environments.PROGRAMS]
+    assert {peer.missing(SWING) for peer in peers} == {
+        "not installed: ./scripts/experiment benchmark --peers installs it"
+    }

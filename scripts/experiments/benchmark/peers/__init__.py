@@ -40,7 +40,7 @@ class Peer(Protocol):
 
 def peers() -> list[Peer]:
     """Return the wrappers of all programs, installed or not."""
-    from scripts.experiments.benchmark.peers.drake import Drake
+    from scripts.experiments.benchmark.peers.environments import program_peers
     from scripts.experiments.benchmark.peers.exudyn import Exudyn
     from scripts.experiments.benchmark.peers.ida import Ida
     from scripts.experiments.benchmark.peers.mujoco import Mujoco
@@ -48,4 +48,4 @@ def peers() -> list[Peer]:
     from scripts.experiments.benchmark.peers.pinocchio_loop import PinocchioLoop
 
     loops = [PinocchioLoop("constraintDynamics"), PinocchioLoop("lcaba")]
-    return [Mujoco(), Drake(), Exudyn(), Pinocchio(), *loops, Ida()]
+    return [Mujoco(), *program_peers(), Exudyn(), Pinocchio(), *loops, Ida()]

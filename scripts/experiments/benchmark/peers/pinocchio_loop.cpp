@@ -161,6 +161,7 @@ struct Problem {
     if (model.nq == model.nv) tau -= stiffness.cwiseProduct(q - rest);
     if (!springs.empty()) pull();
     if (by_lcaba && constraints.size() && constraints[0].m_baumgarte_parameters.Kp > 0) update_errors_of_points();
+    if (by_lcaba) clear_accelerations_of_welds();
     if (by_lcaba) return pin::lcaba(model, data, q, v, tau, constraints, constraint_data, proximal);
     return pin::constraintDynamics(model, data, q, v, tau, constraints, constraint_data, proximal);
   }
@@ -186,6 +187,13 @@ struct Problem {
       for (int k : {0, 1, 2}) rate[at + k] = p_dot[k];
       for (int k : {0, 1, 2, 3}) rate[at + 3 + k] = 0.5 * twice.coeffs()[k];
     }
+  }
+
+  // lcaba of Pinocchio 4.1 adds the accelerations that the call before left to the desired ones of 6D constraints.
+  void clear_accelerations_of_welds() {
+    for (const auto& constraint : constraints)
+      if (constraint.type == pin::CONTACT_6D)
+        data.oa[constraint.joint1_id].setZero(), data.oa[constraint.joint2_id].setZero();
   }
 
   // lcaba of Pinocchio 4.1 reads the errors of point constraints for its Baumgarte terms, but does not compute them.
