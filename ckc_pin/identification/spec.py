@@ -102,8 +102,10 @@ class IdentifySpec(_Spec, frozen=True):
         ``parameters = {"link.link_2.mass" = 0.3}``
     data
         Recorded motions.
+        ``data = [{file = "swing.csv"}]``
     estimate
         What is estimated.
+        ``estimate = {parameters = ["joint.*.friction"]}``
     """
 
     mechanism: str

@@ -224,6 +224,7 @@ def test_recording_of_ros_gives_the_columns_of_its_joint_states(tmp_path, storag
 
 def test_delay_of_torques_is_estimated():
     from ckc_pin.identification.records import Record
+    from ckc_pin.identification.torques import identify_torques
 
     data = record("five_bar", 1e-5, 0.01)
     late = {name: np.interp(data["t"] - 0.0073, data["t"], x) if "tau" in name else x for name, x in data.items()}
