@@ -236,7 +236,7 @@ def estimate_motion(
     distance = np.sqrt(np.mean(off**2, axis=0))
     nearest.require_near(distance, names)
     rho, v_tree, a_tree = nearest.rates(q_tree, measured[1], measured[2])
-    spread = np.array([fit.noise * fit.std[1] for fit in fits.values()])
+    spread = np.array([fit.std[1] for fit in fits.values()])
     by_rate = [(r @ np.linalg.pinv(r[at])) * spread for r in rho[:: max(1, len(rho) // 20)]]
     v_std = np.sqrt(np.mean(np.square(by_rate), axis=0).sum(axis=1))
     return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std), dict(
@@ -270,7 +270,7 @@ def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float
 def _spline_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SplineFit]) -> Array:
     """Return the standard deviations of splines, at least rounding errors."""
     smallest = 1e-12 * mechanism.tree.step_scale[at]
-    return np.maximum([fit.noise * fit.std[0] for fit in fits.values()], smallest)
+    return np.maximum([fit.std[0] for fit in fits.values()], smallest)
 
 
 class _Nearest:

@@ -134,7 +134,7 @@ def test_points_rates_gaps_delays_and_unequal_times():
     result = identify_motion(start, [record], ["joint.theta_2.xyz.x", "joint.theta_1.friction"], robust=False)
     require_truth(result, {"joint.theta_2.xyz.x": 0.2794, "joint.theta_1.friction": 0.02}, 1e-6)
     record = read_record(late, start, DataSpec(file="late", delay={"tau.theta_1": "estimate"}))
-    with pytest.raises(InputError, match='delay: tau.theta_1: method = "torques" estimates delays'):
+    with pytest.raises(InputError, match=r'delay: tau\.theta_1: method = "torques" estimates delays'):
         identify_motion(start, [record], ["joint.theta_1.friction"], robust=False)
 
 

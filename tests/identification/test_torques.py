@@ -222,6 +222,20 @@ def test_recording_of_ros_gives_the_columns_of_its_joint_states(tmp_path, storag
     np.testing.assert_array_equal(read.values["v.theta_2"], np.arange(40.0))
 
 
+def test_noisy_encoders_on_all_joints_are_combined_and_an_offset_is_refused():
+    mechanism, forces = motion("five_bar", 4.0, 0.004)
+    data = record("five_bar", 1e-3, 0.01)
+    for seed, name in enumerate(("theta_2", "theta_4")):  # four encoders of two freedoms disagree by their noise
+        exact = forces.q_tree[:, mechanism.coordinates.index(name)]
+        data[name] = exact + 1e-3 * np.random.default_rng(seed + 10).normal(size=len(exact))
+    result = identify("five_bar", data, PARAMETERS)
+    for name in FRICTION:
+        assert abs(result.parameters[name].value - FRICTION[name]) <= 3 * result.parameters[name].std
+    data["theta_4"] = data["theta_4"] + 0.01
+    with pytest.raises(InputError, match=r"off the constraint manifold, \d+ times its noise"):
+        identify("five_bar", data, PARAMETERS)
+
+
 def test_delay_of_torques_is_estimated():
     from ckc_pin.identification.records import Record
     from ckc_pin.identification.torques import identify_torques
