@@ -49,7 +49,7 @@ NOISE_FLOOR = 1e-9  # of the size of a coordinate: smaller residuals are errors 
 EXACT = 10.0  # residuals up to so many of these floors need no smaller ones
 MAX_STEPS = 60
 STEP_SIZES = 0.5 ** np.arange(11)  # parts of a Gauss-Newton step that are tried
-COST_TOLERANCE = 1e-6  # relative: a smaller decrease of the cost ends the fit
+COST_TOLERANCE = 1e-5  # relative: a smaller decrease of the cost ends the fit
 FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records
 PROMISING = 1e-3  # part of the cost by which the linear model says that it can still decrease
 MEDIAN = 0.6745  # of the absolute value of a standard normal variable
@@ -320,6 +320,7 @@ class _Fit:
         self.robust, self.starts_only = robust, starts_only
         self.starts = [(motion.q, motion.q_dot) for motion in motions]
         self.runs: list[_Run] = []
+        self.rank = 0  # number of combinations of the unknowns that the data determine
         mechanism, quantities = unknowns.mechanism, list_quantities(unknowns.mechanism)
         self.at = mechanism.tree.indices(mechanism.independent, "identify")
         self.floors = [
@@ -430,7 +431,7 @@ class _Fit:
         motion = self.motions[k]
         residual = motion.values - run.predicted
         count = np.isfinite(residual).sum(axis=0)
-        used = 2 * len(self.at) + (0 if self.starts_only else len(self.unknowns.names) / len(self.motions))
+        used = 2 * len(self.at) + self.rank / len(self.motions)
         free = max(1 - used / count.sum(), 1 / count.sum())
         estimate = _rms(residual) / free**0.5
         if self.robust:
@@ -481,6 +482,7 @@ class _Fit:
         dx: Array = np.zeros(len(self.x))
         if not self.starts_only:
             fit = self.linear(stds)
+            self.rank = fit.determined.shape[1]
             dx = self.unknowns.nearest_physical(self.x + fit.x, fit.determined, fit.information) - self.x
         start_steps: list[Array] = []
         for k, std in enumerate(stds):

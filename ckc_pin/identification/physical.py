@@ -23,7 +23,7 @@ __all__ = ["nearest_physical"]
 
 MAX_INFORMATION = 1e3  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
 WEIGHTS = (1e-1, 1e-3, 1e-5, 1e-7)  # of the divergence, one after the other
-MAX_STEPS, STEP_TOLERANCE = 100, 1e-12
+MAX_STEPS, STEP_TOLERANCE = 500, 1e-12
 MIN_EIGENVALUE = 1e-6  # of a prior, relative to its largest in typical sizes: links without mass
 
 
