@@ -51,7 +51,7 @@ def main():
     errors = np.array([x.value - value_of(x, run.mechanism) for x in result.base])
     std = np.array([x.std for x in result.base])
     for x, error in zip(result.base, errors, strict=True):
-        print(f"{x.value:10.6f} ± {x.std:.6f}, off by {error:9.6f}: {x.combination}")
+        print(f"{x.value:10.6f} ± {x.std:.6f}, off by {error:9.6f}: {x}")
     assert np.all(np.abs(errors) < 4 * std)
     assert all(x.rms < 1.05 * TORQUE for x in result.validation.values())
     assert result.parameters["link.link_1.mass"].value is None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +20,7 @@ from ckc_pin.base.validation import describe_value, is_number, require_path, req
 from ckc_pin.errors import InputError
 from ckc_pin.identification.calibration_fit import RANK_TOLERANCE, Fit, Readings
 from ckc_pin.identification.calibration_geometry import Geometry
+from ckc_pin.identification.estimates import Combination, Estimate
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, ROOTS, parts_of, require_known, split_name, values_of, with_components
@@ -27,7 +28,7 @@ from ckc_pin.mechanism.parameters import AXES, ROOTS, parts_of, require_known, s
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Calibration", "Combination", "Estimate", "calibrate"]
+__all__ = ["Calibration", "calibrate"]
 
 IDENTIFIED, BY_PRIOR = "identified", "identified with a prior"
 COMBINED, UNKNOWN = "only in a combination", "not identifiable"
@@ -37,46 +38,6 @@ MAX_MISS = 0.02  # rad, or mechanism sizes: median distance of a mechanism that 
 DEGREES_RATIO = 5.0  # readings are in degrees if converted ones are met so much better
 MIN_COEFFICIENT = 1e-6  # of a combination, with parameters in radians and mechanism sizes
 OUTLIER = 4.5  # standard deviations of a residual
-
-
-class Estimate(NamedTuple):
-    """What the readings say about one parameter.
-
-    Attributes
-    ----------
-    value, std : float or None
-        None if the readings do not determine the parameter.
-    start : float
-        Of the mechanism's files; of an encoder's offset 0.
-    verdict : str
-        "identified", "identified with a prior", "only in a combination" or "not identifiable".
-    """
-
-    value: float | None
-    std: float | None
-    start: float
-    verdict: str
-
-
-class Combination(NamedTuple):
-    """A linear combination of parameters that the readings determine, though not its parameters.
-
-    Attributes
-    ----------
-    terms : dict of str to float
-        Coefficients by parameter.
-    value, std : float
-    """
-
-    terms: dict[str, float]
-    value: float
-    std: float
-
-    def __str__(self) -> str:
-        """Return the combination as a formula."""
-        terms = (f"{'-' if c < 0 else '+'} {'' if abs(abs(c) - 1) < 1e-9 else f'{abs(c):.4g} '}{name}"
-                 for name, c in self.terms.items())  # fmt: skip
-        return " ".join(terms).removeprefix("+ ")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,8 +119,8 @@ class Calibration(HasSummary):
             "name": self.name,
             "status": "converged" if self.converged else "not converged",
             "message": self.message,
-            "parameters": {name: x._asdict() for name, x in self.parameters.items()},
-            "combinations": [{"combination": str(x), **x._asdict()} for x in self.combinations],
+            "parameters": {name: asdict(x) for name, x in self.parameters.items()},
+            "combinations": [x.to_dict() for x in self.combinations],
             "residuals": self.residuals,
             "noise": self.noise,
             "points": self.points,
@@ -170,7 +131,10 @@ class Calibration(HasSummary):
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return the estimates as a pandas DataFrame with a row for each parameter (needs the extra `data`)."""
-        columns = {key: np.array([getattr(x, key) for x in self.parameters.values()]) for key in Estimate._fields}
+        columns = {
+            key: np.array([getattr(x, key) for x in self.parameters.values()])
+            for key in ("value", "std", "start", "verdict")
+        }
         return to_data_frame("parameter", list(self.parameters), columns)
 
     def save(self, path: str | Path) -> Path:

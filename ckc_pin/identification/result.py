@@ -14,6 +14,7 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
+from ckc_pin.identification.estimates import Combination, Estimate
 from ckc_pin.identification.fit import LinearFit
 from ckc_pin.identification.pseudo_inertia import pseudo_inertia
 from ckc_pin.identification.unknowns import Unknowns
@@ -22,46 +23,9 @@ from ckc_pin.mechanism.mechanism import Mechanism
 if TYPE_CHECKING:
     from ckc_pin.view.inline import Figures
 
-__all__ = ["Combination", "Estimate", "Identification", "Prediction", "Residual", "make_result"]
+__all__ = ["Identification", "Prediction", "Residual", "make_result"]
 
 IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE = "identified", "only in a combination", "not identifiable"
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """An estimated parameter.
-
-    Attributes
-    ----------
-    value, std : float or None
-        None if the data do not determine it.
-    start : float
-        Value in the mechanism's files.
-    verdict : str
-        "identified", "only in a combination" or "not identifiable".
-    """
-
-    value: float | None
-    std: float | None
-    start: float
-    verdict: str
-
-
-@dataclass(frozen=True)
-class Combination:
-    """A linear combination of unknowns that the data determine.
-
-    Attributes
-    ----------
-    combination : str
-    coefficients : mapping of str to float
-    value, std : float
-    """
-
-    combination: str
-    coefficients: Mapping[str, float]
-    value: float
-    std: float
 
 
 @dataclass(frozen=True)
@@ -215,7 +179,7 @@ class Identification(HasSummary):
                 name: {"value": x.value, "std": x.std, "start": x.start, "verdict": x.verdict}
                 for name, x in self.parameters.items()
             },
-            "base": [{"combination": x.combination, "value": x.value, "std": x.std} for x in self.base],
+            "base": [x.to_dict() for x in self.base],
             "condition": self.condition,
             "residuals": {name: {"rms": x.rms, "expected": x.expected} for name, x in self.residuals.items()},
             "validation": {name: {"rms": x.rms, "expected": x.expected} for name, x in self.validation.items()},
@@ -292,16 +256,9 @@ def _combinations(unknowns: Unknowns, fit: LinearFit, values: Array, tolerance: 
         factors = row / scale * scale[k]  # in SI units, 1 for the chosen unknown
         std = float(np.sqrt(row @ fit.covariance @ row)) * scale[k]
         terms = [int(k), *(int(i) for i in np.flatnonzero(factors) if i != k)]
-        text = " ".join(_term(float(factors[i]), names[i], first=not number) for number, i in enumerate(terms))
         value = float(factors @ values)
-        combinations.append(Combination(text, {names[i]: float(factors[i]) for i in terms}, value, std))
+        combinations.append(Combination({names[i]: float(factors[i]) for i in terms}, value, std))
     return tuple(combinations)
-
-
-def _term(coefficient: float, name: str, *, first: bool) -> str:
-    sign = "-" if coefficient < 0 else "" if first else "+"
-    size = "" if abs(abs(coefficient) - 1) < 1e-9 else f"{abs(coefficient):.6g} "
-    return f"{sign}{'' if first or not sign else ' '}{size}{name}"
 
 
 def _describe(name: str, estimate: Estimate) -> str:

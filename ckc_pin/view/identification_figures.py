@@ -22,6 +22,7 @@ __all__ = ["draw_identification", "save_identification"]
 MAX_LAGS = 50
 CONFIDENCE = 1.96  # standard deviations of the autocorrelation of independent residuals
 MAX_LABELS = 30
+LABEL_WIDTH = 3.6  # inches, of names and the scale beside a matrix
 POINTS = 4000  # of a curve
 
 
@@ -119,7 +120,7 @@ def _draw_correlation(result: Identification) -> Figure:
     names = result.identified
     std = np.sqrt(np.maximum(np.diag(result.covariance), 1e-300))
     size = 2.0 + 0.22 * min(len(names), MAX_LABELS)
-    figure = Figure(figsize=(size + 1.6, size), layout="constrained")
+    figure = Figure(figsize=(size + LABEL_WIDTH, size), layout="constrained")
     ax = figure.subplots()
     image = ax.imshow(result.covariance / np.outer(std, std), cmap="RdBu_r", vmin=-1, vmax=1)
     figure.colorbar(image, ax=ax, label="correlation", shrink=0.7)
@@ -128,5 +129,6 @@ def _draw_correlation(result: Identification) -> Figure:
     else:
         ax.set_ylabel(f"{len(names)} parameters, in the order of identification.json")
     ax.set_xticks([])
+    ax.grid(visible=False)
     ax.set_title("Errors of the identified parameters", loc="left")
     return figure

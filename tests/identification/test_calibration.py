@@ -263,7 +263,7 @@ def test_size_of_a_five_bar_cannot_be_known_from_encoders(five_bar: Mechanism) -
     # The ratios of the lengths are known: L_k - r_k L = 0, of which r_k is the ratio of the estimates.
     assert len(result.combinations) == 4
     for combination in result.combinations:
-        (first, one), (last, ratio) = combination.terms.items()
+        (first, one), (last, ratio) = combination.coefficients.items()
         lengths = dict(zip(LENGTHS, [*TRUTH[:4], BASE], strict=True))
         assert one == 1.0
         assert -ratio == pytest.approx(lengths[first] / lengths[last], rel=0.02)
