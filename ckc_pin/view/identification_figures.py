@@ -22,7 +22,7 @@ __all__ = ["draw_identification", "save_identification"]
 MAX_LAGS = 50
 CONFIDENCE = 1.96  # standard deviations of the autocorrelation of independent residuals
 MAX_LABELS = 30
-LABEL_WIDTH = 3.6  # inches, of names and the scale beside a matrix
+LABEL_WIDTH = 2.4  # inches, of names and the scale beside a matrix
 POINTS = 4000  # of a curve
 
 
@@ -71,7 +71,7 @@ def _draw_predictions(result: Identification) -> Figure:
         ax.plot(motion.t[::stride], predicted[::stride], color=style.COLOURS[1], linewidth=1.2, label="predicted")
         ax.plot(motion.t[::stride], measured[::stride], ".", color=style.COLOURS[0], markersize=2, label="measured")
         ax.set_ylabel(label)
-    panels[0].legend(loc="upper right", ncols=2, fontsize=8)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, fontsize=8)
     panels[-1].set_xlabel("time [s]")
     return figure
 
