@@ -59,7 +59,7 @@ __all__ = ["excite"]
 @click.option(
     "--set",
     "settings",
-    metavar="KEY=VALUE",
+    metavar="NAME=VALUE",
     multiple=True,
     help="Override a parameter of the mechanism. May be repeated.",
 )

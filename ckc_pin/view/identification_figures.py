@@ -72,7 +72,7 @@ def _draw_predictions(result: Identification) -> Figure:
         ax.plot(motion.t[::stride], measured[::stride], ".", color=style.COLOURS[0], markersize=2, label="measured")
         ax.set_ylabel(label)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, fontsize=8)
-    panels[-1].set_xlabel("time [s]")
+    panels[-1].set_xlabel("time (s)")
     return figure
 
 
@@ -102,15 +102,15 @@ def _draw_residuals(result: Identification) -> Figure:
         over_time.set_ylabel(label)
     panels[0, 0].set_title("measured less predicted", loc="left")
     panels[0, 1].set_title("autocorrelation", loc="left")
-    panels[-1, 0].set_xlabel("time [s]")
-    panels[-1, 1].set_xlabel("lag [instants]")
+    panels[-1, 0].set_xlabel("time (s)")
+    panels[-1, 1].set_xlabel("lag (instants)")
     return figure
 
 
 def _labels(result: Identification, names: Sequence[str]) -> list[str]:
     """Return the labels of quantities; motors are known without their prefix."""
     quantities = list_quantities(result.mechanism)
-    return [f"{escape_mathtext(name.removeprefix('tau.'))} [{quantities[name].unit}]" for name in names]
+    return [f"{escape_mathtext(name.removeprefix('tau.'))} ({quantities[name].unit})" for name in names]
 
 
 def _draw_correlation(result: Identification) -> Figure:

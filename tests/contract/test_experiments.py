@@ -29,7 +29,7 @@ PARTS = {
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }
 HAS_OUT = {"paper", "ensembles"}
-NOT_RUN = {"map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles"}
+NOT_RUN = {"map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles", "iftomm"}
 
 
 def run(*arguments: str) -> Outcome:

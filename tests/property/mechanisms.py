@@ -166,9 +166,11 @@ def _closing_loop(kind: LoopType, world: World, q: Numbers, rows_in: RowsIn) -> 
     )
 
 
-def differentiate_along(mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array]) -> Array:
+def differentiate_along(
+    mechanism: Mechanism, q_tree: Array, v_tree: Array, f: Callable[[Array], Array], step: float = 2e-4
+) -> Array:
     """Return the derivative of f(q') along a tangent velocity, by differences."""
-    return slope(lambda t: f(mechanism.tree.integrate(q_tree, t * v_tree)))
+    return slope(lambda t: f(mechanism.tree.integrate(q_tree, t * v_tree)), step)
 
 
 def _triple(vector: Array) -> tuple[float, float, float]:

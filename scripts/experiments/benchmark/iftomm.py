@@ -103,8 +103,8 @@ def write_solutions(folder: Path, problems: tuple[IftommProblem, ...] = PROBLEMS
         error = np.abs(work.observed(q_tree[:: (len(t) - 1) // INSTANTS]) - exact.values).max()
         conserved = not (work.controlled or work.mechanism.springs.any_damping or work.mechanism.springs.constant.any())
         rows.append({
-            "problem": problem.key, "name": problem.name, "largest error, m or rad": f"{error:.1e}",
-            "energy drift, J": f"{np.ptp(energy):.1e}" if conserved else "", "CPU time, s": f"{wall_s:.2e}",
+            "problem": problem.key, "name": problem.name, "largest error (m or rad)": f"{error:.1e}",
+            "energy drift (J)": f"{np.ptp(energy):.1e}" if conserved else "", "CPU time (s)": f"{wall_s:.2e}",
             "CPU": machine(), "method": f"ckc_pin, DAE, rtol {RTOL:g}, Pinocchio {versions()['pin']}",
         })  # fmt: skip
         files.append(path)
