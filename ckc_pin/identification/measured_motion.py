@@ -20,13 +20,13 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_spline",
-           "motion_along", "motion_from_states"]  # fmt: skip
+           "motion_along"]  # fmt: skip
 
 DEGREE = 5
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
 MIN_SAMPLES_PER_KNOT = 3.0
 EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
-MAX_ITERATIONS, MAX_START_STEPS = 20, 40
+MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
 DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
 OFF_BRANCH = (
@@ -166,31 +166,31 @@ def _spline_std(spline: Any, t: Array) -> tuple[Array, Array]:
     return std, factor
 
 
-def motion_from_states(mechanism: Mechanism, t: Array, q_tree: Array, v_tree: Array, a_tree: Array) -> MeasuredMotion:
-    """Return an exact motion, such as that of a simulated run, given in the coordinates of the tree."""
-    rho = np.array([mechanism.kinematics(q).rho for q in q_tree])
-    return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
-
-
 def close_many(mechanism: Mechanism, q_tree: Array, q: Array) -> Array:
     """Return closed configurations (m, nq) with independent coordinates q (m, d), near others (InputError)."""
-    guess = np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
-    return _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d)).solve_many(guess, q)
+    return _nearest_by_q(mechanism).solve_many(_all_coordinates(mechanism, q_tree), q)
 
 
 def motion_along(
     mechanism: Mechanism, t: Array, q_tree: Array, q: Array, q_dot: Array, q_ddot: Array
 ) -> MeasuredMotion:
     """Return the exact motion with independent coordinates q (m, d), closed near q_tree (InputError)."""
-    nearest = _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d))
-    q_tree = close_many(mechanism, q_tree, q)
+    nearest = _nearest_by_q(mechanism)
+    q_tree = nearest.solve_many(_all_coordinates(mechanism, q_tree), q)
     rho, v_tree, a_tree = nearest.rates(q_tree, q_dot, q_ddot)
     return MeasuredMotion(t, q_tree, v_tree, a_tree, rho, np.zeros(mechanism.n))
 
 
-def estimate_motion(
-    mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit], instants: Array
-) -> tuple[MeasuredMotion, dict[str, float]]:
+def _nearest_by_q(mechanism: Mechanism) -> _Nearest:
+    return _Nearest(mechanism, mechanism.partition.q, np.ones(mechanism.d))
+
+
+def _all_coordinates(mechanism: Mechanism, q_tree: Array) -> Array:
+    """Return the coordinates (m, n) of configurations (m, nq)."""
+    return np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
+
+
+def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit], instants: Array) -> MeasuredMotion:
     """Estimate the motion of all coordinates at instants from the splines of at least d coordinates.
 
     Parameters
@@ -202,12 +202,6 @@ def estimate_motion(
         By coordinate.
     instants : (m,) array
         Those closer to an end than a knot interval and a half are left out.
-
-    Returns
-    -------
-    MeasuredMotion
-    dict of str to float
-        By coordinate, the root mean square distance of the motion from its spline.
 
     Raises
     ------
@@ -222,26 +216,21 @@ def estimate_motion(
         raise InputError(f"identify: the data last {t[-1] - t[0]:.3g} s, too short for a spline of {', '.join(names)}")
     nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
-    here, few = (
-        nearest.start(measured[0, 0], names),
-        np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int)),
-    )
+    here = nearest.start(measured[0, 0], names)
+    few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
     followed = []
     for k in few:
         here = nearest.solve(here, measured[0, k])
         followed.append(tree.to_coordinates(here.q_tree))
     guess = np.array([np.interp(instants, instants[few], column) for column in np.array(followed).T]).T
     q_tree = nearest.solve_many(guess, measured[0])
-    off = np.array([tree.to_coordinates(q) for q in q_tree])[:, at] - measured[0]
-    distance = np.sqrt(np.mean(off**2, axis=0))
-    nearest.require_near(distance, names)
+    off = _all_coordinates(mechanism, q_tree)[:, at] - measured[0]
+    nearest.require_near(np.sqrt(np.mean(off**2, axis=0)), names)
     rho, v_tree, a_tree = nearest.rates(q_tree, measured[1], measured[2])
     spread = np.array([fit.std[1] for fit in fits.values()])
     by_rate = [(r @ np.linalg.pinv(r[at])) * spread for r in rho[:: max(1, len(rho) // 20)]]
     v_std = np.sqrt(np.mean(np.square(by_rate), axis=0).sum(axis=1))
-    return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std), dict(
-        zip(names, distance.tolist(), strict=True)
-    )
+    return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std)
 
 
 def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
@@ -290,7 +279,7 @@ class _Nearest:
         here = self.mechanism.assembled
         first = self.mechanism.tree.to_coordinates(here.q_tree)[self.at]
         steps = 1 + int(np.max(np.abs(measured - first) / self.mechanism.tree.step_scale[self.at]) / 0.1)
-        if steps > 40 * MAX_START_STEPS:
+        if steps > MAX_START_STEPS:
             largest = names[int(np.argmax(np.abs(measured)))]
             raise InputError(f"identify: {largest} begins at {np.abs(measured).max():.4g}; are its values in degrees?")
         for k in range(1, steps + 1):
@@ -321,7 +310,7 @@ class _Nearest:
             closing = np.zeros((len(q_tree), tree.n))
             if phi.shape[1]:
                 closing[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, phi[:, :, None])[:, :, 0]
-            numbers = np.array([tree.to_coordinates(q) for q in q_tree])
+            numbers = _all_coordinates(self.mechanism, q_tree)
             dq = self._independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
             step = closing + np.einsum("knd,kd->kn", rho, dq)
             q_tree = integrate_many(tree, q_tree, step)

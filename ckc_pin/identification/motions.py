@@ -290,7 +290,7 @@ def _outputs(result: Sensitivities, names: Sequence[str], index: IntArray) -> tu
 
 
 def _rms(residual: Array) -> Array:
-    """Return the root mean square of each column, of the values that are no gaps; 0 if there is none."""
+    """Return the root mean square of each column, leaving out NaN; 0 without values."""
     count = np.isfinite(residual).sum(axis=0)
     return np.sqrt(np.nansum(residual**2, axis=0) / np.maximum(count, 1))
 

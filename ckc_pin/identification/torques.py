@@ -115,7 +115,7 @@ def _equations(
     at = np.flatnonzero(used & ~saturated)
     at = at[:: max(1, -(-len(at) // max_instants))]
     first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
-    motion, _ = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
+    motion = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
     columns, force = regressor.rows(motion)
     to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
