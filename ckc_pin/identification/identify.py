@@ -13,7 +13,7 @@ from ckc_pin.identification.records import Record, read_record
 from ckc_pin.identification.result import Identification
 from ckc_pin.identification.spec import IdentifySpec, read_identify
 from ckc_pin.identification.torques import identify_torques
-from ckc_pin.kinematics.loading import load
+from ckc_pin.kinematics.loading import as_mechanism, load
 from ckc_pin.mechanism.library import is_path
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -70,7 +70,7 @@ def identify(
     """
     if method not in METHODS:
         raise InputError(f'identify: method: expected "torques" or "motion", got {describe_value(method)}')
-    mechanism = mechanism if isinstance(mechanism, Mechanism) else load(mechanism)
+    mechanism = as_mechanism(mechanism, "identify")
     records = [
         Record(x.source, x.t, x.values, {**(noise or {}), **x.noise}, x.delay, for_validation)
         for group, for_validation in ((data, False), (validation, True))

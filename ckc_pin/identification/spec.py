@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.toml import convert, join_dotted_keys, read_text, read_toml
+from ckc_pin.base.toml import FileStruct, convert, join_dotted_keys, read_text, read_toml
 from ckc_pin.errors import InputError
 
 __all__ = ["UNITS", "DataSpec", "EstimateSpec", "IdentifySpec", "read_identify"]
@@ -19,11 +19,7 @@ UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "rad": 1.0, "deg": 0.0174
 PositiveFloat = Annotated[float, msgspec.Meta(gt=0)]
 
 
-class _Spec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class DataSpec(_Spec, frozen=True):
+class DataSpec(FileStruct, frozen=True, kw_only=True):
     """One recorded motion.
 
     Attributes
@@ -63,7 +59,7 @@ class DataSpec(_Spec, frozen=True):
     validation: bool = False
 
 
-class EstimateSpec(_Spec, frozen=True):
+class EstimateSpec(FileStruct, frozen=True, kw_only=True):
     """What is estimated, and how.
 
     Attributes
@@ -89,7 +85,7 @@ class EstimateSpec(_Spec, frozen=True):
     robust: bool = False
 
 
-class IdentifySpec(_Spec, frozen=True):
+class IdentifySpec(FileStruct, frozen=True, kw_only=True):
     """An identification: a mechanism, recorded motions, and what is estimated from them.
 
     Attributes
