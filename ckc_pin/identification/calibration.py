@@ -20,7 +20,15 @@ from ckc_pin.base.validation import describe_value, is_number, require_path, req
 from ckc_pin.errors import InputError
 from ckc_pin.identification.calibration_fit import RANK_TOLERANCE, Fit, Readings
 from ckc_pin.identification.calibration_geometry import Geometry
-from ckc_pin.identification.estimates import Combination, Estimate
+from ckc_pin.identification.estimates import (
+    BY_PRIOR,
+    IDENTIFIED,
+    IN_COMBINATION,
+    NOT_IDENTIFIABLE,
+    Combination,
+    Estimate,
+)
+from ckc_pin.identification.records import read_csv
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, ROOTS, parts_of, require_known, split_name, values_of, with_components
@@ -30,8 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Calibration", "calibrate"]
 
-IDENTIFIED, BY_PRIOR = "identified", "identified with a prior"
-COMBINED, UNKNOWN = "only in a combination", "not identifiable"
 GEOMETRIC = ("xyz", "rpy", "length", "ratio", "offset")  # ends of the names of parameters that move points or loops
 TRACKER = tuple(f"tracker.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 MAX_MISS = 0.02  # rad, or mechanism sizes: median distance of a mechanism that can follow its readings
@@ -234,7 +240,7 @@ def _read(mechanism: Mechanism, poses: Any) -> Readings:
     """Return the readings of a mapping or a CSV file (InputError)."""
     where = "calibrate: poses"
     if isinstance(poses, str | Path):
-        where, poses = str(poses), _read_csv(poses)
+        where, poses = str(poses), read_csv(poses)
     require_table(poses, where, "a table of arrays by the names of readings, or the path of a CSV file")
     joints = [name for name in mechanism.coordinates if name not in mechanism.tree.free_coordinates]
     points = [f"{point}.{axis}" for point in mechanism.points for axis in AXES]
@@ -258,28 +264,6 @@ def _read(mechanism: Mechanism, poses: Any) -> Readings:
     component = np.array([-1 if name in joints else points.index(name) for name in poses], dtype=np.intp)
     in_metres = np.where(coordinate < 0, True, mechanism.tree.in_metres[coordinate])
     return Readings(tuple(poses), np.array(columns).T, coordinate, component, in_metres)
-
-
-def _read_csv(path: str | Path) -> dict[str, list[float]]:
-    """Return the columns of a CSV file. An empty cell is NaN."""
-    import csv
-
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
-    header = [cell.strip() for cell in rows[0]] if rows else []
-    if len(set(header)) < len(header):
-        raise InputError(f"{path}: its first line names a column twice")
-    for number, row in enumerate(rows[1:], 2):
-        if len(row) != len(header):
-            raise InputError(f"{path}: row {number} has {len(row)} cells, the first line {len(header)}")
-    try:
-        numbers = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows[1:]]
-    except ValueError as error:
-        raise InputError(f"{path}: {error}; expected numbers below the names of readings") from None
-    return {name: [row[k] for row in numbers] for k, name in enumerate(header)}
 
 
 def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[list[str], IntArray]:
@@ -434,7 +418,7 @@ def _estimate(fit: Fit, k: int, space: _RowSpace, by_data: _RowSpace, covariance
         verdict = IDENTIFIED if k in by_data.single else BY_PRIOR
         return Estimate(float(fit.values[k]), float(np.sqrt(covariance[k, k])), start, verdict)
     is_combined = any(k in terms for terms in space.rows)
-    return Estimate(None, None, start, COMBINED if is_combined else UNKNOWN)
+    return Estimate(None, None, start, IN_COMBINATION if is_combined else NOT_IDENTIFIABLE)
 
 
 def _combine(fit: Fit, names: Sequence[str], terms: Mapping[int, float], covariance: Array) -> Combination:

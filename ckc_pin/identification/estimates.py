@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Combination", "Estimate"]
+__all__ = ["BY_PRIOR", "IDENTIFIED", "IN_COMBINATION", "NOT_IDENTIFIABLE", "Combination", "Estimate"]
+
+# verdicts
+IDENTIFIED, BY_PRIOR = "identified", "identified with a prior"
+IN_COMBINATION, NOT_IDENTIFIABLE = "only in a combination", "not identifiable"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.columns import list_quantities
 from ckc_pin.run.run import Run
 
-__all__ = ["Record", "read_record", "require_radians"]
+__all__ = ["Record", "read_csv", "read_record", "require_radians"]
 
 MAX_BYTES = 2_000_000_000
 RECORDED = ("q_tree", "v_tree", "tau", "point_positions")
@@ -131,21 +131,35 @@ def _read_file(path: Path) -> dict[str, Array]:
             return _read_parquet(path)
         if is_bag(path):
             return read_bag(path)
-        with path.open(encoding="utf-8", newline="") as file:
-            names = [name.strip() for name in next(csv.reader(file), [])]
-            numbers = np.genfromtxt(file, delimiter=",", dtype=float)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
+    return {name: np.array(column) for name, column in read_csv(path).items()}
+
+
+def read_csv(path: str | Path) -> dict[str, list[float]]:
+    """Return the columns of a CSV file. An empty cell is NaN.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, a name stands twice in its first line, or another line has no numbers or not as many.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from None
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    if len(set(header)) < len(header):
+        raise InputError(f"{path}: its first line names a column twice")
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(header):
+            raise InputError(f"{path}: row {number} has {len(row)} cells, the first line {len(header)}")
+    try:
+        numbers = [[float(cell) if cell.strip() else np.nan for cell in row] for row in rows[1:]]
     except ValueError as error:
-        raise InputError(f"{path}: not a table of numbers below a row of names: {str(error).splitlines()[0]}") from None
-    numbers = np.atleast_2d(numbers)
-    if not names or numbers.shape[1] != len(names):
-        raise InputError(
-            f"{path}: {len(names)} names in the first row and {numbers.shape[1]} columns of numbers below it"
-        )
-    if len(set(names)) != len(names):
-        raise InputError(f"{path}: a name stands twice in the first row")
-    return dict(zip(names, numbers.T, strict=True))
+        raise InputError(f"{path}: {error}; expected numbers below the names of readings") from None
+    return {name: [row[k] for row in numbers] for k, name in enumerate(header)}
 
 
 def _read_parquet(path: Path) -> dict[str, Array]:

@@ -14,7 +14,7 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
-from ckc_pin.identification.estimates import Combination, Estimate
+from ckc_pin.identification.estimates import IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE, Combination, Estimate
 from ckc_pin.identification.fit import LinearFit
 from ckc_pin.identification.pseudo_inertia import pseudo_inertia
 from ckc_pin.identification.unknowns import Unknowns
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from ckc_pin.view.inline import Figures
 
 __all__ = ["Identification", "Prediction", "Residual", "make_result"]
-
-IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE = "identified", "only in a combination", "not identifiable"
 
 
 @dataclass(frozen=True)

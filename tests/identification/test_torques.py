@@ -188,6 +188,12 @@ def test_offsets_gaps_units_and_delays():
     assert result.instants < 905
 
 
+def test_text_in_a_csv_file_is_no_gap(tmp_path):
+    (tmp_path / "arm.csv").write_text("t,theta_1\n0,1\n1,\n2,n.a.\n")
+    with pytest.raises(InputError, match=r"arm\.csv: could not convert string to float: 'n\.a\.'"):
+        identify("five_bar", tmp_path / "arm.csv", PARAMETERS)
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_recording_of_ros_gives_the_columns_of_its_joint_states(tmp_path, storage):
     from rosbags.rosbag2 import StoragePlugin, Writer
