@@ -17,6 +17,7 @@ import eigenpy
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.sparse import determinant, is_large_and_sparse, sparse_lu
 
 __all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns", "remove_direction"]
 
@@ -99,7 +100,7 @@ class Factorization:
         A pivot is exactly zero, so that the matrix cannot be solved with.
     """
 
-    __slots__ = ("_lu", "_lu_transposed", "_matrix", "_q", "shape", "singular")
+    __slots__ = ("_lu", "_lu_transposed", "_matrix", "_q", "_sparse_lu", "shape", "singular")
 
     def __init__(self, matrix: Array) -> None:
         self.shape = matrix.shape
@@ -107,6 +108,10 @@ class Factorization:
             self._q, self._matrix = None, matrix
         else:
             self._q, self._matrix = np.linalg.qr(matrix)
+        self._sparse_lu = sparse_lu(self._matrix) if is_large_and_sparse(self._matrix) else None
+        if self._sparse_lu:
+            self.singular = False
+            return
         self._lu = eigenpy.PartialPivLU(self._matrix)  # after QR the matrix is R, whose LU factorization is R itself
         self._lu_transposed: Any = None
         self.singular = not bool(np.all(np.diagonal(self._lu.matrixLU())))
@@ -117,7 +122,8 @@ class Factorization:
             return _solve_columns(self.solve, right, self.shape[1])
         if self.shape[1] == 0:
             return np.zeros(0)
-        return np.ravel(self._lu.solve(right if self._q is None else self._q.T @ right))
+        lu = self._sparse_lu or self._lu
+        return np.ravel(lu.solve(right if self._q is None else self._q.T @ right))
 
     def solve_transposed(self, right: Array) -> Array:
         """Solve A^T x = right, with minimum norm if A is tall; right has shape (k,) or (k, p)."""
@@ -125,15 +131,20 @@ class Factorization:
             return _solve_columns(self.solve_transposed, right, self.shape[0])
         if self.shape[1] == 0:
             return np.zeros(self.shape[0])
-        if self._lu_transposed is None:
-            self._lu_transposed = eigenpy.PartialPivLU(self._matrix.T)
-        x = np.ravel(self._lu_transposed.solve(right))
+        if self._sparse_lu:
+            x = np.ravel(self._sparse_lu.solve(right, "T"))
+        else:
+            if self._lu_transposed is None:
+                self._lu_transposed = eigenpy.PartialPivLU(self._matrix.T)
+            x = np.ravel(self._lu_transposed.solve(right))
         return x if self._q is None else np.asarray(self._q @ x)
 
     def determinant(self) -> float:
         """Return the determinant (ValueError for a tall matrix)."""
         if self._q is not None:
             raise ValueError("determinant: the matrix is not square")
+        if self._sparse_lu:
+            return determinant(self._sparse_lu)
         return float(self._lu.determinant()) if self.shape[0] else 1.0
 
 
@@ -232,7 +243,7 @@ def remove_direction(matrix: Array, direction: Array, columns: IntArray, sizes: 
         matrix[:, columns] -= np.outer(direction, direction @ matrix[:, columns])
     else:
         rows = np.flatnonzero(direction)
-        parts = direction[rows] @ matrix[np.ix_(rows, columns)]
-        columns = columns[np.flatnonzero(parts)]
-        matrix[np.ix_(rows, columns)] -= np.outer(direction[rows], parts[parts != 0.0])
+        parts = direction[rows] @ matrix[rows]
+        columns = columns[np.flatnonzero(parts[columns])]
+        matrix[np.ix_(rows, columns)] -= np.outer(direction[rows], parts[columns])
     sizes[columns] = np.linalg.norm(matrix[:, columns], axis=0)

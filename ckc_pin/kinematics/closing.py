@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array
+from ckc_pin.base.sparse import factorize_full_row_rank
 from ckc_pin.kinematics.continuation import MAX_NEWTON_STEP
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose
@@ -137,7 +138,7 @@ def _gauss_newton(
             stalled = norms[-1] > (1 - STALL_DECREASE) * norms[-1 - STALL_ITERATIONS]
             if stalled and norms[-1] > open_norm:
                 break
-        part: Array = -np.asarray(np.linalg.lstsq(jacobian() * tree.step_scale, phi, rcond=1e-6)[0], dtype=float)
+        part = -_minimum_norm_solution(jacobian() * tree.step_scale, phi)
         longest, step = float(np.abs(part).max(initial=0.0)), part * tree.step_scale
         scale = min(1.0, MAX_NEWTON_STEP / longest) if longest > 0 else 0.0
         while scale > 1e-6:
@@ -150,6 +151,11 @@ def _gauss_newton(
         else:
             break
     return q
+
+
+def _minimum_norm_solution(jacobian: Array, phi: Array) -> Array:
+    full = factorize_full_row_rank(jacobian)
+    return full.minimum_norm(phi) if full else np.asarray(np.linalg.lstsq(jacobian, phi, rcond=1e-6)[0], dtype=float)
 
 
 def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, IntArray, lazy
 from ckc_pin.mechanism.closure import Closure
-from ckc_pin.mechanism.pose import Anchors, Pose
+from ckc_pin.mechanism.pose import Anchors, Pose, dot_rows
 from ckc_pin.mechanism.rows import Affine, Component, Curved, Distance, Dot, RelativeLog, Rows
 from ckc_pin.mechanism.tree import Tree
 
@@ -197,6 +197,14 @@ class ManyPoses(Pose):
         """Jacobians of the differences, shape (count * k, 3, n)."""
         k = self.p.shape[1] // 2
         return (self.p_jacobian[:, :k] - self.p_jacobian[:, k:]).reshape(-1, 3, self.columns)
+
+    def project_r_jacobian(self, pair: IntArray, e: Array) -> Array:
+        """Return the rows e_i . d r_i / dq' of vectors e (k, 3), shape (k, n)."""
+        return dot_rows(e, self.r_jacobian[pair])
+
+    def project_e_angular(self, direction: IntArray, torque: Array) -> Array:
+        """Return the rows torque_i . d omega_i / dv' of the joints that directions are fixed to, shape (k, n)."""
+        return dot_rows(torque, self.e_angular[direction])
 
     @lazy
     def e(self) -> Array:

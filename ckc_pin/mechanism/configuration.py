@@ -8,6 +8,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
 from ckc_pin.base.linear_algebra import Factorization
+from ckc_pin.base.sparse import smallest_singular_value
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Pose, Rate
 from ckc_pin.mechanism.rank import scale_jacobian
@@ -57,7 +58,7 @@ class Kinematics:
         """Columns of J of the independent coordinates, shape (rows, d)."""
         return self.J[:, self.partition.q]
 
-    @property
+    @lazy
     def phi_z(self) -> Array:
         """Columns of J of the dependent coordinates, shape (rows, n - d)."""
         return self.J[:, self.partition.z]
@@ -85,7 +86,7 @@ class Kinematics:
             return float("inf")
         if not np.all(np.isfinite(self.phi_z)):
             return float("nan")
-        return float(np.linalg.svd(self.phi_z, compute_uv=False)[len(self.partition.z) - 1])
+        return smallest_singular_value(self.phi_z)
 
     def margin(self) -> float:
         """Return the smallest singular value of phi_z relative to |J|, both dimensionless; inf if z is empty.
@@ -97,8 +98,7 @@ class Kinematics:
         J = scale_jacobian(self.J, self.tree, self.closure)
         if not np.all(np.isfinite(J)):
             return float("nan")
-        smallest = np.linalg.svd(J[:, self.partition.z], compute_uv=False)[len(self.partition.z) - 1]
-        return float(smallest / max(np.linalg.norm(J), 1e-300))
+        return smallest_singular_value(J[:, self.partition.z]) / max(float(np.linalg.norm(J)), 1e-300)
 
     def integrate(self, step: Array) -> Kinematics:
         """Return the kinematics at the configuration that a tangent step leads to."""

@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 GENERATORS = ("n_four_bar",)
-MAX_N = 320  # squares: 2 N + 1 coordinates
+MAX_N = 1000  # squares: 2 N + 1 coordinates
 
 
 class GeneratorSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

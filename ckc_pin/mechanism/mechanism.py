@@ -369,7 +369,7 @@ class Mechanism(HasSummary):
     def _choose_independent(self, motors: Motors | None, preset: Sequence[str] | None) -> None:
         """Choose q and z, or check a preset choice."""
         coordinates = set(range(self.n))
-        splits_roots = self.freedoms.dependent is None  # every choice splits the six coordinates of a free root
+        splits_roots = self.freedoms.splits_roots
         if splits_roots:
             pivoted = choose_dependent(self.freedoms.jacobian, self.rank)
             best = [self.coordinates[k] for k in sorted(coordinates - set([] if pivoted is None else pivoted.tolist()))]
@@ -431,7 +431,7 @@ class Mechanism(HasSummary):
         order = sorted(range(self.n), key=lambda k: (*rank_of[k], k))
         blocks = [np.arange(v, v + 6) for _, v in self.tree.free_roots]
         z = choose_dependent_by_priority(self.freedoms.jacobian, self.rank, order, driven.tolist(), blocks)
-        assert z is not None  # as freedoms.dependent
+        assert z is not None  # since the roots need not be split
         first = [int(k) for k in driven if k not in z]
         return [self.coordinates[k] for k in [*first, *(k for k in range(self.n) if k not in {*z, *first})]]
 

@@ -9,7 +9,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
 from ckc_pin.mechanism.tree import Tree
 
-__all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross"]
+__all__ = ["Anchors", "BodyPose", "Pose", "Rate", "cross", "dot_rows"]
 
 # _LEVI_CIVITA[3 * b + i, a] = epsilon_iab, so that (omega x p)_i = sum_ab epsilon_iab omega_a p_b
 _LEVI_CIVITA = np.zeros((9, 3))
@@ -17,6 +17,14 @@ for _i in range(3):
     _a, _b = (_i + 1) % 3, (_i + 2) % 3
     _LEVI_CIVITA[3 * _b + _i, _a] = 1.0
     _LEVI_CIVITA[3 * _a + _i, _b] = -1.0
+
+
+MIN_WRENCH_SIZE = 100  # coordinates from which Jacobians of points cost more than wrenches
+
+
+def dot_rows(e: Array, jacobian: Array) -> Array:
+    """Return the rows e_i . J_i of vectors (k, 3) and Jacobians (k, 3, n)."""
+    return np.asarray((e[:, None, :] @ jacobian)[:, 0, :])
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -93,11 +101,40 @@ class Pose:
         moved = (self.p @ self.lever).reshape(len(self.p), 3, -1) + self.linear_part
         return self.support[self.anchors.point_joint] * moved
 
+    def p_motions(self, tangent: Array) -> Array:
+        """Velocities of the points for columns of v' (n, d), shape (6 k, d)."""
+        motions = self.tree.body_motions(self.q_tree, tangent)[self.anchors.point_joint]
+        velocities = motions[:, :3] + np.cross(motions[:, 3:], self.p[:, :, None], axis=1)
+        return velocities.reshape(3 * len(motions), tangent.shape[1])
+
     @lazy
     def r_jacobian(self) -> Array:
         """Jacobians of the differences, shape (k, 3, n)."""
         k = len(self.p) // 2
         return self.p_jacobian[:k] - self.p_jacobian[k:]
+
+    def project_r_jacobian(self, pair: IntArray, e: Array) -> Array:
+        """Return the rows e_i . d r_i / dq' of vectors e (k, 3), shape (k, n).
+
+        The Jacobians of r of a large mechanism are left out: a vector at a point is a wrench, whose moment about the
+        world's origin multiplies the angular part.
+        """
+        if self.tree.n < MIN_WRENCH_SIZE:
+            return dot_rows(e, self.r_jacobian[pair])
+        k = len(self.p) // 2
+        rows = np.zeros((len(pair), self.linear_part.shape[1]))
+        for sign, at in ((1.0, pair), (-1.0, k + pair)):
+            wrench = sign * np.hstack([e, cross(self.p[at], e)])
+            moved = wrench @ np.vstack([self.linear_part, self.angular_part])
+            moved *= self.support[self.anchors.point_joint[at], 0]
+            rows += moved
+        return rows
+
+    def project_e_angular(self, direction: IntArray, torque: Array) -> Array:
+        """Return the rows torque_i . d omega_i / dv' of the joints that directions are fixed to, shape (k, n)."""
+        if self.tree.n < MIN_WRENCH_SIZE:
+            return dot_rows(torque, self.e_angular[direction])
+        return np.asarray(self.support[self.anchors.direction_joint[direction], 0] * (torque @ self.angular_part))
 
     @lazy
     def e(self) -> Array:

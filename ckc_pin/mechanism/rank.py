@@ -9,6 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns, remove_direction
+from ckc_pin.base.sparse import factorize_full_row_rank
 from ckc_pin.mechanism.closure import Closure
 from ckc_pin.mechanism.pose import Anchors, Pose
 from ckc_pin.mechanism.tree import Tree
@@ -71,6 +72,9 @@ def compute_rank(scaled_jacobian: Array) -> RankReport:
     """Return the number of singular values above `RANK_TOLERANCE` times the largest."""
     if min(scaled_jacobian.shape) == 0:
         return RankReport(0, 0.0, 0.0)
+    full = factorize_full_row_rank(scaled_jacobian)
+    if full:
+        return RankReport(len(scaled_jacobian), full.smallest / full.largest, 0.0)
     values = np.linalg.svd(scaled_jacobian, compute_uv=False)
     values = values / max(float(values[0]), 1e-300)
     rank = int(np.sum(values > RANK_TOLERANCE))
@@ -196,8 +200,8 @@ class Freedoms(Immutable):
         Rows that the other rows imply, one admissible choice.
     immobile : (n,) bool array
         Coordinates that the loops do not let move, here and nearby.
-    dependent : (rank,) int array or None
-        The best-conditioned choice of z; None if it would split a free root.
+    splits_roots : bool
+        Every choice of z splits the six coordinates of a free root.
     jacobian : (rows, n) array
         The dimensionless J that the rank was computed from.
     warnings : tuple of str
@@ -208,7 +212,7 @@ class Freedoms(Immutable):
     singular: bool
     redundant: tuple[tuple[str, str], ...]
     immobile: BoolArray
-    dependent: IntArray | None
+    splits_roots: bool
     jacobian: Array
     warnings: tuple[str, ...]
 
@@ -229,7 +233,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     jacobian = _scaled_at(tree, closure, q_tree)
     here = there = compute_rank(jacobian)
     jacobians = [(here.rank, jacobian)]
-    for other in nearby(_right_singular_vectors(jacobian)[here.rank :]):
+    for other in nearby(_null_space_rows(jacobian, here.rank)):
         candidate = _scaled_at(tree, closure, other)
         report = compute_rank(candidate)
         jacobians.append((report.rank, candidate))
@@ -238,7 +242,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
     immobile = np.full(tree.n, len(jacobians) > 1 or there.rank == tree.n)
     for rank, candidate in jacobians:
         if rank == there.rank:
-            immobile &= np.linalg.norm(_right_singular_vectors(candidate)[rank:], axis=0) <= IMMOBILE_TOLERANCE
+            immobile &= np.linalg.norm(_null_space_rows(candidate, rank), axis=0) <= IMMOBILE_TOLERANCE
     warnings: list[str] = []
     if there.rank > here.rank:
         warnings.append(
@@ -257,7 +261,7 @@ def count_freedoms(tree: Tree, closure: Closure, q_tree: Array, nearby: Callable
         singular=there.rank > here.rank,
         immobile=immobile,
         redundant=tuple(closure.names[k] for k in redundant_rows(jacobian, there.rank)),
-        dependent=choose_dependent(jacobian, there.rank, blocks),
+        splits_roots=bool(blocks) and choose_dependent(jacobian, there.rank, blocks) is None,
         jacobian=jacobian,
         warnings=tuple(warnings),
     )
@@ -279,20 +283,21 @@ def idle_coordinates(tree: Tree, tangent: Array, q_tree: Array, anchors: Sequenc
     shafts : (m, n) array
         Rates of motor shafts, and of springs on joints, by joint rates.
     """
-    ends = [Pose(tree, x, q_tree).p_jacobian.reshape(-1, tree.n) for x in anchors if len(x.point_joint)]
-    moves = np.vstack([tree.centre_of_mass_jacobians(q_tree), *ends, shafts]) @ tangent
+    ends = [Pose(tree, x, q_tree).p_motions(tangent) for x in anchors if len(x.point_joint)]
+    moves = np.vstack([tree.centre_of_mass_motions(q_tree, tangent), *ends, shafts @ tangent])
     if 0 in moves.shape:
         return []
-    _, values, directions = np.linalg.svd(moves, full_matrices=True)
+    _, values, directions = np.linalg.svd(np.linalg.qr(moves, mode="r"), full_matrices=True)
     idle_motions = directions[int(np.sum(values > IDLE_TOLERANCE * max(values[0], 1e-300))) :] @ tangent.T
     # Singular vectors of equal values mix the spins of several bodies; the pivots of a QR belong to one body each.
     order, _ = pivoted_columns(idle_motions)
     return [tree.coordinates[k] for k in sorted(int(k) for k in order[: len(idle_motions)])]
 
 
-def _right_singular_vectors(jacobian: Array) -> Array:
-    """Return the right singular vectors of J as rows, those of its null space last, shape (n, n)."""
-    return np.linalg.svd(jacobian, full_matrices=True)[2]
+def _null_space_rows(jacobian: Array, rank: int) -> Array:
+    """Return an orthonormal basis of the null space of J as rows, shape (n - rank, n)."""
+    full = factorize_full_row_rank(jacobian)
+    return full.null_space().T if full else np.linalg.svd(jacobian, full_matrices=True)[2][rank:]
 
 
 def _scaled_at(tree: Tree, closure: Closure, q_tree: Array) -> Array:

@@ -33,7 +33,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
-from ckc_pin.mechanism.pose import Pose, Rate, cross
+from ckc_pin.mechanism.pose import Pose, Rate, cross, dot_rows
 from ckc_pin.mechanism.tree import Tree
 
 __all__ = [
@@ -70,11 +70,6 @@ class Rows(Protocol):
         """Time derivative of the constraint Jacobian at the velocity of `rate`, shape (rows, n)."""
 
 
-def _project(e: Array, jacobian: Array) -> Array:
-    """Return the rows e_i . J_i of directions (k, 3) and Jacobians (k, 3, n)."""
-    return (e[:, None, :] @ jacobian)[:, 0, :]
-
-
 @dataclass(frozen=True)
 class Component(Immutable):
     """e . r, the component of the difference of two points along a direction.
@@ -95,19 +90,19 @@ class Component(Immutable):
 
     def jacobian(self, pose: Pose) -> Array:
         e = pose.e[self.direction]
-        jacobian = _project(e, pose.r_jacobian[self.pair])
+        jacobian = pose.project_r_jacobian(self.pair, e)
         if self.turning:  # e_dot . r = (omega x e) . r = omega . (e x r)
-            jacobian += _project(cross(e, pose.r[self.pair]), pose.e_angular[self.direction])
+            jacobian += pose.project_e_angular(self.direction, cross(e, pose.r[self.pair]))
         return jacobian
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         e = pose.e[self.direction]
-        jacobian_dot = _project(e, rate.r_jacobian_dot[self.pair])
+        jacobian_dot = dot_rows(e, rate.r_jacobian_dot[self.pair])
         if self.turning:
             r, r_dot, e_dot = pose.r[self.pair], rate.r_dot[self.pair], rate.e_dot[self.direction]
-            jacobian_dot += _project(e_dot, pose.r_jacobian[self.pair])
-            jacobian_dot += _project(cross(e_dot, r) + cross(e, r_dot), pose.e_angular[self.direction])
-            jacobian_dot += _project(cross(e, r), rate.e_angular_dot[self.direction])
+            jacobian_dot += dot_rows(e_dot, pose.r_jacobian[self.pair])
+            jacobian_dot += dot_rows(cross(e_dot, r) + cross(e, r_dot), pose.e_angular[self.direction])
+            jacobian_dot += dot_rows(cross(e, r), rate.e_angular_dot[self.direction])
         return jacobian_dot
 
 
@@ -128,12 +123,12 @@ class Dot(Immutable):
     def jacobian(self, pose: Pose) -> Array:
         # (omega_a x a) . b + a . (omega_b x b) = (omega_a - omega_b) . (a x b)
         normal = cross(pose.e[self.a], pose.e[self.b])
-        return _project(normal, pose.e_angular[self.a] - pose.e_angular[self.b])
+        return pose.project_e_angular(self.a, normal) - pose.project_e_angular(self.b, normal)
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         a, b = pose.e[self.a], pose.e[self.b]
         normal_dot = cross(rate.e_dot[self.a], b) + cross(a, rate.e_dot[self.b])
-        return _project(normal_dot, pose.e_angular[self.a] - pose.e_angular[self.b]) + _project(
+        return dot_rows(normal_dot, pose.e_angular[self.a] - pose.e_angular[self.b]) + dot_rows(
             cross(a, b), rate.e_angular_dot[self.a] - rate.e_angular_dot[self.b]
         )
 
@@ -154,11 +149,11 @@ class Distance(Immutable):
         return (np.sum(r * r, axis=1) - self.length**2) / (2 * self.length)
 
     def jacobian(self, pose: Pose) -> Array:
-        return _project(pose.r[self.pair] / self.length[:, None], pose.r_jacobian[self.pair])
+        return pose.project_r_jacobian(self.pair, pose.r[self.pair] / self.length[:, None])
 
     def jacobian_dot(self, pose: Pose, rate: Rate) -> Array:
         length = self.length[:, None]
-        return _project(rate.r_dot[self.pair] / length, pose.r_jacobian[self.pair]) + _project(
+        return dot_rows(rate.r_dot[self.pair] / length, pose.r_jacobian[self.pair]) + dot_rows(
             pose.r[self.pair] / length, rate.r_jacobian_dot[self.pair]
         )
 

@@ -27,7 +27,7 @@ from ckc_pin.errors import InputError, MechanismError
 __all__ = ["Tree"]
 
 
-MAX_COORDINATES = 1000  # the factorizations of one state then take seconds
+MAX_COORDINATES = 3000  # matrices of one state then take 70 MB each
 MAX_FULL_WORKSPACE = 325  # coordinates; a full workspace takes about 65 n^3 bytes, here 2.2 GB
 LARGE_COORDINATE = 100.0  # rad, or mechanism sizes: above it, rounding of a coordinate shows in the closure of loops
 MAX_TOLERANCE_FACTOR = 1e4  # reached at a million radians; a closure to 1e-13 of the size is then one to 1e-9
@@ -237,17 +237,28 @@ class Tree:
                 upper[k] = high if high < UNLIMITED else np.inf
         return lower, upper
 
-    def centre_of_mass_jacobians(self, q_tree: Array) -> Array:
-        """Return the stacked Jacobians of the centres of mass of all moving bodies with mass, shape (3 bodies, n)."""
-        placement, jacobian = self.kinematics(q_tree)
-        rows = [np.zeros((0, self.n))]
-        for joint in range(1, self.model.njoints):
-            inertia = self.model.inertias[joint]
-            if inertia.mass > 0:
-                lever = placement[joint, :9].reshape(3, 3).T @ inertia.lever + placement[joint, 9:]
-                angular = jacobian[3:] * self.support[joint, 0]
-                rows.append(jacobian[:3] * self.support[joint, 0] + np.cross(angular.T, lever).T)
-        return np.vstack(rows)
+    def body_motions(self, q_tree: Array, tangent: Array) -> Array:
+        """Return the spatial velocities of all bodies for columns of v' (n, d), in world axes at the world's origin.
+
+        Shape (joints, 6, d), linear velocities first.
+        """
+        _, jacobian = self.kinematics(q_tree)
+        motions = np.zeros((self.model.njoints, 6, tangent.shape[1]))
+        for joint, parent in list(enumerate(self.model.parents))[1:]:
+            columns = slice(self.model.idx_vs[joint], self.model.idx_vs[joint] + self.model.nvs[joint])
+            motions[joint] = motions[parent] + jacobian[:, columns] @ tangent[columns]
+        return motions
+
+    def centre_of_mass_motions(self, q_tree: Array, tangent: Array) -> Array:
+        """Return the velocities of the centres of mass of all moving bodies with mass, shape (3 bodies, d)."""
+        placement, _ = self.kinematics(q_tree)
+        motions = self.body_motions(q_tree, tangent)
+        joints = [k for k in range(1, self.model.njoints) if self.model.inertias[k].mass > 0]
+        lever = np.array([self.model.inertias[k].lever for k in joints]).reshape(-1, 3, 1)
+        rotation = placement[joints, :9].reshape(-1, 3, 3).transpose(0, 2, 1)
+        centre = rotation @ lever + placement[joints, 9:, None]
+        velocities = motions[joints, :3] + np.cross(motions[joints, 3:], centre, axis=1)
+        return velocities.reshape(3 * len(joints), tangent.shape[1])
 
     def integrate(self, q_tree: Array, step: Array) -> Array:
         """Return the configuration that a tangent step leads to."""

@@ -156,6 +156,22 @@ def generated_sizes(
     generated_sizes.main(mechanisms or ())
 
 
+@app.command("right_hand_sides", epilog=examples("right_hand_sides", "right_hand_sides talos 40 chains_40"))
+def right_hand_sides(
+    mechanisms: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="MECHANISM", show_default=False, help="shipped name, N squares in a row, chains_DEPTH"),
+    ] = None,
+) -> None:
+    """Measure one right-hand side by size of mechanism, beside Pinocchio's lcaba.
+
+    Prints times, their ratios, and the exponent of growth with the number of squares.
+    """
+    from scripts.experiments import right_hand_sides
+
+    right_hand_sides.main(mechanisms or ())
+
+
 @app.command(
     epilog=examples("benchmark --quick --out out/report", "benchmark --page", 'benchmark --peer "python my_peer.py"')
 )

@@ -43,7 +43,7 @@ SCENE = [
     _value("mechanism=nothing.toml", "bar/nothing.toml: no such mechanism file"),
     _value("mechanism=3", "mechanism = 3: expected a string or a table"),
     _value('mechanism={generator="x"}', "mechanism.generator = 'x'; valid: 'n_four_bar'"),
-    _value('mechanism={generator="n_four_bar", N=1000000000}', "mechanism.N = 1000000000: ", "at most 320"),
+    _value('mechanism={generator="n_four_bar", N=1000000000}', "mechanism.N = 1000000000: ", "at most 1000"),
     _file("no mechanism", 'mechanism = "mechanism.toml"', "", "the key 'mechanism' is missing"),
     _file("no formulation", 'formulation = "dae"', "", "'formulation' is missing; valid: 'dae', 'reduced', 'spf'"),
     _file("malformed", "t_end = 2.0", "t_end = ", "malformed TOML", "line "),

@@ -23,6 +23,7 @@ PARTS = {
     "stability": (["length"], "| length | 21 | 21 | 0 | 0 |"),
     "rank_loss": (["--quick", "--formulation", "dae"], "0 wrong"),
     "generated_sizes": (["1"], "| 1 | 3 |"),
+    "right_hand_sides": (["1"], "| 1 | 3 | 1 |"),
     "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
     "peer": ([f"{sys.executable} {SCIPY_PEER}", "tracking_1e-04"], "tracking_1e-04: not compared, the law of"),

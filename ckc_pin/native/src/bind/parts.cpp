@@ -42,7 +42,7 @@ struct BoundPredictor {
   BoundPredictor(const nb::typed<nb::dict, nb::str, nb::any>& table, VectorArg q_tree, double epsilon)
       : core(core_from_table(table)), predictor(*core, epsilon) {
     core->set_configuration(q_tree), core->compute_rho();
-    chart.reset(*core, q_tree), predictor.reset(*core, q_tree);
+    chart.reset(*core, q_tree), predictor.reset(*core, q_tree, true);
   }
   void add(double t, VectorArg q_tree, VectorArg v_tree, VectorArg w) {
     core->set_configuration(q_tree), core->compute_rho();

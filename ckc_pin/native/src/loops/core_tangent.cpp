@@ -17,6 +17,9 @@ constexpr double rank_lost_pivot = 1e-12, min_pivot_for_inertia_metric = 1e-3;
 // The tangent basis keeps its partition while the pivot ratio is larger and its entries are smaller than these. A new
 // partition has to satisfy the stricter last bound.
 constexpr double min_partition_pivot = 1e-2, max_partition_slope = 4.0, max_new_partition_slope = 3.0;
+// Coordinates above which the basis of a check keeps the partition if it is well conditioned: the time of pivoting grows
+// as n^3.
+constexpr int max_pivoted_size = 300;
 // Rounding error of an acceleration, relative to the forces that cause it.
 constexpr double acceleration_rounding_factor = 1e-13;
 
@@ -261,6 +264,7 @@ void Core::project_on_tangent_space(In u_tree, Out a) {
 bool Core::find_basis_for_check() {
   compute_J(), compute_bias();
   minus_residual_ = -J_dot_v, x_.setZero();
+  if (n > max_pivoted_size && find_basis_by_partition()) return true;
   basis_configuration_ = -1;  // compute the partition's basis again when it is needed
   if (constraints.closure.rows) return find_basis_by_pivoting(rank_lost_pivot);
   tangent_.setIdentity();

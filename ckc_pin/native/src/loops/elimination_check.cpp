@@ -21,7 +21,10 @@ static bool project_onto_manifold(Core& core, Vector& q_tree, Vector& v) {
     core.tree.integrate(q_tree, step);
   }
   core.set_configuration(q_tree);
-  if (!core.elimination_step(core.constraints.J * v, step)) return false;
+  core.compute_J();
+  Vector phi_dot(core.constraints.closure.rows);
+  core.constraints.multiply_J(v, phi_dot);
+  if (!core.elimination_step(phi_dot, step)) return false;
   v += step;
   return true;
 }

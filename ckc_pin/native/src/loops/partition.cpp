@@ -6,6 +6,9 @@
 
 namespace ckc {
 
+constexpr int max_pivoted_size = 300;  // coordinates above which J is not decomposed: the time of that grows as n^3
+constexpr double min_exchange_factor = 1.5;
+
 namespace {
 
 Matrix columns_of(const Matrix& a, const Indices& at) {
@@ -53,7 +56,34 @@ bool choose_dependent(const Core& core, const Matrix& J, Indices& z) {
 
 }  // namespace
 
+// Exchange a dependent coordinate for an independent one while this multiplies |det phi_z| enough. Needs only rho: its
+// entry of both coordinates, dimensionless, is the factor.
+static void exchange_coordinates(Core& core, Partition& best) {
+  core.compute_rho();
+  best = {core.q, core.z};
+  Matrix rho = core.scales.columns.cwiseInverse().asDiagonal() * core.rho;
+  for (int k = 0; k < core.d; ++k) rho.col(k) *= core.scales.columns(best.q[k]);
+  for (int exchanges = 0; exchanges < core.n; ++exchanges) {
+    double largest = min_exchange_factor;
+    size_t dependent = 0;
+    int independent = -1;
+    for (int k = 0; k < core.d; ++k)
+      for (size_t i = 0; i < best.z.size(); ++i)
+        if (std::abs(rho(best.z[i], k)) > largest) largest = std::abs(rho(best.z[i], k)), dependent = i, independent = k;
+    if (independent < 0) return;
+    rho.col(independent) /= rho(best.z[dependent], independent);
+    for (int k = 0; k < core.d; ++k)
+      if (k != independent) rho.col(k) -= rho(best.z[dependent], k) * rho.col(independent);
+    std::swap(best.z[dependent], best.q[independent]);
+  }
+}
+
 bool find_best_partition(Core& core, Partition& best) {
+  if (core.n > max_pivoted_size && core.tree.roots.empty()) {
+    exchange_coordinates(core, best);
+    if (best.q != core.q) std::sort(best.q.begin(), best.q.end()), std::sort(best.z.begin(), best.z.end());
+    return true;
+  }
   core.compute_J();
   best = {};
   const Matrix J = core.scales.rows.asDiagonal() * core.constraints.J * core.scales.columns.asDiagonal();

@@ -12,8 +12,11 @@ Predictor::Predictor(const Core& core, double epsilon) : epsilon_(epsilon) {
   w_change_.setZero(core.constraints.closure.rows), step_.setZero(core.n), difference_.setZero(core.n);
 }
 
-void Predictor::reset(const Core& core, In q_tree) {
-  for (Point& point : points_) point.rho = core.rho, point.phi_z = core.phi_z;
+void Predictor::reset(const Core& core, In q_tree, bool visits_level_sets) {
+  for (Point& point : points_) {
+    point.rho = core.rho;
+    if (visits_level_sets) point.phi_z = core.phi_z;
+  }
   dq_.setZero(core.d), distance_step_.setZero(core.d), z_.setZero(core.z.size());
   count_ = 0, last_point_ = max_points, visited_level_sets_ = false;
   points_[max_points].q_tree = q_tree;

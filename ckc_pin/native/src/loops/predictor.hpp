@@ -13,7 +13,8 @@ class Predictor {
  public:
   Predictor(const Core& core, double epsilon);
 
-  void reset(const Core& core, In q_tree);  // forget all points; the first prediction starts there
+  // Forget all points; the first prediction starts there. `visits_level_sets`: w may be different from zero.
+  void reset(const Core& core, In q_tree, bool visits_level_sets);
   // Store the core's configuration, which is on the level set w. It replaces the point at the same t.
   void add(double t, const Core& core, In q_tree, In v_tree, In w);
   // Predict the configuration at q, given by its `coordinates` in a chart.

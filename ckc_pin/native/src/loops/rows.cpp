@@ -248,6 +248,21 @@ void ConstraintRows::bias(Out J_dot_v) const {
   }
 }
 
+void ConstraintRows::multiply_J(In v, Out product) const {
+  for (int i = 0; i < closure.rows; ++i) {
+    double sum = 0.0;
+    for (int j : pattern[i]) sum += J(i, j) * v(j);
+    product(i) = sum;
+  }
+}
+
+double ConstraintRows::J_norm() const {
+  double square = 0.0;
+  for (int i = 0; i < closure.rows; ++i)
+    for (int j : pattern[i]) square += J(i, j) * J(i, j);
+  return std::sqrt(square);
+}
+
 std::vector<Indices> ConstraintRows::pattern_in(const Indices& columns, int n) const {
   Indices at(n, -1);
   for (size_t j = 0; j < columns.size(); ++j) at[columns[j]] = static_cast<int>(j);

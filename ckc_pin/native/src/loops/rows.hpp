@@ -81,6 +81,8 @@ class ConstraintRows {
   void update_rates(const Tree& tree, In v);
   void update_jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
   void bias(Out J_dot_v) const;  // requires update_rates
+  void multiply_J(In v, Out product) const;
+  double J_norm() const;
 
  private:
   void update_relative_rotations(const Tree& tree);

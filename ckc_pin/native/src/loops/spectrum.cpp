@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <iterator>
 #include <utility>
 
 namespace ckc {
@@ -23,16 +22,21 @@ SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int c
   const int m = static_cast<int>(pattern_.size());
   is_dense_ = m <= max_dense_rows || rank < m;
   scaled_.setZero(m, columns), gram_.setZero(m, m), u_.setZero(m);
-  std::vector<Indices> coupled_rows(m);
-  for (int a = 0; a < m; ++a)
-    for (int b = 0; b < m; ++b) {
-      Indices columns_of_both;
-      std::set_intersection(pattern_[a].begin(), pattern_[a].end(), pattern_[b].begin(), pattern_[b].end(),
-                            std::back_inserter(columns_of_both));
-      if (columns_of_both.empty()) continue;
-      coupled_rows[a].push_back(b);
-      if (b <= a) pairs_.push_back({a, b, std::move(columns_of_both)});
+  std::vector<Indices> coupled_rows(m), rows_of_column(columns), common_columns(m);
+  for (int i = 0; i < m; ++i)
+    for (int j : pattern_[i]) rows_of_column[j].push_back(i);
+  for (int a = 0; a < m; ++a) {
+    for (int j : pattern_[a])
+      for (int b : rows_of_column[j]) {
+        if (common_columns[b].empty()) coupled_rows[a].push_back(b);
+        common_columns[b].push_back(j);
+      }
+    std::sort(coupled_rows[a].begin(), coupled_rows[a].end());
+    for (int b : coupled_rows[a]) {
+      if (b <= a) pairs_.push_back({a, b, common_columns[b]});
+      common_columns[b].clear();
     }
+  }
   factor_.set_pattern(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
   if (!is_dense_) basis_.setZero(m, max_steps_), next_.setZero(m), projections_.setZero(max_steps_);
   // A solver that has computed nothing cannot be copied, so use it once.
@@ -106,7 +110,9 @@ void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
     }
   }
   u = u_;
-  v.noalias() = scaled_.transpose() * u;
+  v.setZero(scaled_.cols());
+  for (size_t i = 0; i < pattern_.size(); ++i)
+    for (int j : pattern_[i]) v(j) += scaled_(i, j) * u(i);
 }
 
 }  // namespace ckc

@@ -21,7 +21,7 @@ Dae::Dae(Core& core_, Control& control_, double tolerance, bool projects, double
       projects_(projects) {
   crosses_singularities = projects;
   q_tree_.setZero(core.tree.nq), step_.setZero(core.n), z_step_.setZero(core.n), no_force_.setZero(core.n),
-      residual_.setZero(core.constraints.closure.rows);
+      residual_.setZero(core.constraints.closure.rows), phi_dot_.setZero(core.constraints.closure.rows);
 }
 
 void Dae::start(double, In q_tree, In v, In, Out y) {
@@ -99,14 +99,14 @@ bool Dae::evaluate_rate(double t, In v, Out y_dot) {
 
 // Baumgarte's terms 2 alpha phi_dot + beta^2 phi, into residual_.
 void Dae::add_stabilization(In v) {
-  phi_dot_.noalias() = core.constraints.J * v;
+  core.constraints.multiply_J(v, phi_dot_);
   if (core.has_row_motion()) phi_dot_ -= core.row_motion.rate;
   residual_ += 2 * alpha_ * phi_dot_ + beta_ * beta_ * core.constraints.phi;
 }
 
 // phi_dot at velocity v, into residual_.
 void Dae::set_rate_residual(In v) {
-  residual_.noalias() = core.constraints.J * v;
+  core.constraints.multiply_J(v, residual_);
   if (core.has_row_motion()) residual_ -= core.row_motion.rate;
 }
 
@@ -169,14 +169,14 @@ bool Dae::project_onto_manifold(In y) {
   for (int k = 0; largest_entry(core.constraints.phi) > tolerance; ++k) {
     if (k == max_newton_steps || !core.constraints.phi.allFinite() || !closure_step(core.constraints.phi)) return false;
     ++counts.newton, counts.factorizations += 2;
-    residual_.noalias() = core.constraints.J * step_;
+    core.constraints.multiply_J(step_, residual_);
     core.tree.integrate(q_tree_, step_);
     set_core(q_tree_);
     if (largest_entry(residual_) <= tolerance) break;  // redundant rows that contradict each other keep phi large
   }
   velocity = velocity_in(y);
   set_rate_residual(velocity);
-  if (largest_entry(residual_) <= rounding * core.constraints.J.norm() * velocity.norm()) return true;
+  if (largest_entry(residual_) <= rounding * core.constraints.J_norm() * velocity.norm()) return true;
   if (!closure_step(residual_)) return false;
   velocity += step_;
   return velocity.allFinite();

@@ -45,7 +45,7 @@ void LevelSet::start(double t, In q_tree, In v, In w_start, Out y) {
 
 void LevelSet::reset_coordinates(In q_tree) {
   chart_.reset(core, q_tree);
-  predictor_.reset(core, q_tree);
+  predictor_.reset(core, q_tree, !on_manifold_);
   accepted_q_tree_ = last_q_tree_ = q_tree;
   search_margin_ = partition_search_margin;
   partition_changed();
@@ -238,7 +238,7 @@ bool LevelSet::return_to_accepted() {
 void LevelSet::predict_from_accepted() {
   core.set_configuration(accepted_q_tree_);
   core.compute_rho();
-  predictor_.reset(core, accepted_q_tree_);
+  predictor_.reset(core, accepted_q_tree_, !on_manifold_);
 }
 
 void LevelSet::full_motion(In f, Out x, Out x_dot) const {

@@ -75,9 +75,9 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   double max_phi_error = 0.0, max_phi_dot_error = 0.0;
   for (int i = 0; i < m; ++i) {
     max_phi_error = std::max(max_phi_error, std::abs(core.constraints.phi(i) - system.w(i)));
-    max_phi_dot_error = std::max(max_phi_dot_error, std::abs(core.constraints.J.row(i).dot(system.velocity) -
-                                                             system.w_decay_rate() * system.w(i) -
-                                                             (core.has_row_motion() ? core.row_motion.rate(i) : 0.0)));
+    double rate = -system.w_decay_rate() * system.w(i) - (core.has_row_motion() ? core.row_motion.rate(i) : 0.0);
+    for (int j : core.constraints.pattern[i]) rate += core.constraints.J(i, j) * system.velocity(j);
+    max_phi_dot_error = std::max(max_phi_dot_error, std::abs(rate));
   }
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
   if (system.forces()) append(system.forces()->wrenches);

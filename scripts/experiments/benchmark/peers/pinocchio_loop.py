@@ -38,6 +38,7 @@ QUICK_PROXIMAL = {
     "constraintDynamics": PROXIMAL["constraintDynamics"][::2],
     "lcaba": PROXIMAL["lcaba"][:3],
 }
+SETTINGS_OF_ONE_CALL = (*PROXIMAL["lcaba"], *PROXIMAL["constraintDynamics"], (1e-8, 2, 0.0), (1e-10, 2, 0.0))
 CHECKED = {"constraintDynamics": (1e-8, 3), "lcaba": (1e-3, 5)}  # mu and iterations of the comparison at the start
 ACCURACY = 1e-13  # accuracy of the multipliers at which the proximal iterations end
 START = 5.0  # s: allowance for the start of the program
@@ -89,6 +90,25 @@ class PinocchioLoop:
             f"{abs(numbers['energy'][0] - energy):.0e} J; the constrained acceleration differs by "
             f"{_relative_difference(numbers['acceleration'], ours):.0e}"
         )
+
+    def acceleration_s(self, work: Work, accuracy: float) -> float | None:
+        """Return the time of an acceleration at the start by the fastest setting that is accurate enough, s.
+
+        Parameters
+        ----------
+        work : Work
+        accuracy : float
+            Largest difference from ckc_pin's acceleration, relative to its largest entry.
+        """
+        q_tree, v_tree = start_of(work)
+        terms = Terms(work.mechanism, work.mechanism.kinematics(q_tree), v_tree)
+        reference = dae_acceleration(terms, np.zeros(work.mechanism.n))
+        times = []
+        for mu, iterations, _ in SETTINGS_OF_ONE_CALL:
+            answer = _answer(_problem(work, self.algorithm, 0.0, mu, iterations, TOLERANCES[0], []), None)
+            if _relative_difference(np.array(answer["acceleration"][0]), reference) <= accuracy:
+                times.append(answer["acceleration_s"][0][0])
+        return min(times, default=None)
 
     def compute(self, work: Work, setting: str, budget: float) -> Motion:
         gain, mu, iterations, tolerance = (float(part.split()[1]) for part in setting.split(", "))
