@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 from ckc_pin import Mechanism, Run, load, simulate
 from ckc_pin.codegen.library import compile_terms
@@ -28,6 +29,9 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("ckc_pin")
+# Hypothesis would also draw constants from the source of all modules that the process has imported. Examples would then
+# depend on the tests that ran before, and every worker would parse a thousand modules.
+pytest.MonkeyPatch().setattr(providers, "_get_local_constants", lambda: providers._local_constants)
 
 # A shell ignores SIGINT for background jobs, and child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
