@@ -23,7 +23,7 @@ def measure(plate_mass, seed):
     """Return noisy encoder and torque readings of one second, with a plate of this mass."""
     controller = {"type": "tracking", "Lambda": 1.0, "K_D": 10.0, "desired": WAVES}
     scene = ckc_pin.Scene("delta", t_end=1.0, controller=controller, parameters={"link.plate.mass": plate_mass})
-    motion = ckc_pin.inverse_dynamics(scene, {"solver.output_dt": 0.002})
+    motion = ckc_pin.inverse_dynamics(scene, {"solver.output_dt": 0.004})
     random = np.random.default_rng(seed)
     readings = {"t": motion.t}
     for k, name in enumerate(motion.mechanism.motors.names):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 from ckc_pin import Mechanism, Run, load, simulate
 from ckc_pin.codegen.library import compile_terms
@@ -28,6 +29,9 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("ckc_pin")
+# Hypothesis would also draw constants from the source of all modules that the process has imported. Examples would then
+# depend on the tests that ran before, and every worker would parse a thousand modules.
+pytest.MonkeyPatch().setattr(providers, "_get_local_constants", lambda: providers._local_constants)
 
 # A shell ignores SIGINT for background jobs, and child processes would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -36,37 +40,52 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # The files that take longest, of the seconds of all tests about half. They are begun first, so that all workers end at
 # about the same time.
 SLOW_FILES = (
-    "docs/test_site.py",
-    "browser/test_explore_by_hand.py",
+    "docs/test_snippets.py",
+    "identification/test_torques.py",
     "ensembles/test_sweep.py",
     "contract/test_cli_signals.py",
-    "docs/test_snippets.py",
+    "docs/test_site.py",
+    "browser/test_explore_by_hand.py",
     "browser/test_player.py",
-    "sensitivity/test_couplings.py",
     "browser/test_explore_page.py",
-    "browser/test_explore_connection.py",
+    "analytic/test_desired_motions.py",
     "sensitivity/test_named_parameters.py",
     "sensitivity/test_compiled_terms.py",
     "contract/test_experiments.py",
-    "browser/test_playback.py",
-    "contract/test_report_command.py",
-    "fuzz/test_fuzz.py",
-    "browser/test_explore_dragging.py",
     "sensitivity/test_control.py",
-    "analytic/test_map.py",
-    "property/test_dynamics.py",
-    "codegen/test_far_masses.py",
-    "codegen/test_compiled.py",
-    "analytic/test_derivatives.py",
     "examples/test_examples.py",
-    "ensembles/test_interrupt.py",
-    "contract/test_map_command.py",
-    "contract/test_figures.py",
-    "analytic/test_sections.py",
-    "explorer/test_branches.py",
-    "analysis/test_work_precision.py",
-    "regression/test_ivp.py",
+    "codegen/test_far_masses.py",
+    "identification/test_motions.py",
+    "identification/test_excitation.py",
     "analytic/test_prescribed.py",
+    "fuzz/test_fuzz.py",
+    "property/test_dynamics.py",
+    "regression/test_ivp.py",
+    "browser/test_playback.py",
+    "identification/test_calibration.py",
+    "analytic/test_map.py",
+    "browser/test_explore_connection.py",
+    "browser/test_explore_dragging.py",
+    "codegen/test_derivatives.py",
+    "contract/test_scene_from_python.py",
+    "analysis/test_work_precision.py",
+    "codegen/test_compiled.py",
+    "contract/test_report_command.py",
+    "analytic/test_derivatives.py",
+    "contract/test_sensors.py",
+    "joints/test_mechanisms.py",
+    "analytic/test_prescribed_in_part.py",
+    "sensitivity/test_sensitivities.py",
+    "ensembles/test_damaged_results.py",
+    "regression/test_inverse_forward.py",
+    "analytic/test_sections.py",
+    "property/test_closure.py",
+    "contract/test_names.py",
+    "contract/test_figures.py",
+    "contract/test_map_command.py",
+    "sensitivity/test_couplings.py",
+    "contract/test_run_warnings.py",
+    "codegen/test_library.py",
 )
 
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}

@@ -127,7 +127,7 @@ def _follow_tangent(
     """Follow the tangent until the curve closes or ends; return its points and whether it is closed."""
     points, step = [first], max_step
     while len(points) < max_points:
-        next_point = _take_step(system, points[-1], step)
+        next_point = _take_step(system, points[-2] if len(points) > 1 else None, points[-1], step)
         if next_point is not None:
             if len(points) > MIN_CLOSED_POINTS and _lies_between(first, points[-1], next_point):
                 return [*points, first], True
@@ -140,11 +140,22 @@ def _follow_tangent(
     return points, False
 
 
-def _take_step(system: SingularSystem, point: _CurvePoint, step: float) -> _CurvePoint | None:
-    """Predict along the tangent and correct; return None if the result is not the next point of the same curve."""
-    n = system.mechanism.n
-    guess = point.at.integrate(step * point.tangent[:n])
-    at, null, residual = system.solve(guess, point.null + step * point.tangent[n:], iterations=CORRECTOR_ITERATIONS)
+def _take_step(
+    system: SingularSystem, before: _CurvePoint | None, point: _CurvePoint, step: float
+) -> _CurvePoint | None:
+    """Predict and correct; return None if the result is not the next point of the same curve.
+
+    The prediction is the cubic through the last two points with their tangents, or the tangent of the first point.
+    """
+    n, prediction = system.mechanism.n, step * point.tangent
+    if before is not None:
+        chord = np.concatenate([point.at.tree.difference(before.at.q_tree, point.at.q_tree), point.null - before.null])
+        length = np.linalg.norm(chord)
+        excess = (length * point.tangent - chord) / length**2
+        cubic = 2 * excess + (before.tangent - point.tangent) / length
+        prediction += step**2 * (excess + cubic) + step**3 / length * cubic
+    guess = point.at.integrate(prediction[:n])
+    at, null, residual = system.solve(guess, point.null + prediction[n:], iterations=CORRECTOR_ITERATIONS)
     if residual > max(RESIDUAL_TOLERANCE, system.mechanism.tolerance):
         return None
     tangent = _tangent(system, at, null)

@@ -240,10 +240,13 @@ def remove_direction(matrix: Array, direction: Array, columns: IntArray, sizes: 
         Norms of all columns.
     """
     if matrix.size < MIN_SPARSE_SIZE:
-        matrix[:, columns] -= np.outer(direction, direction @ matrix[:, columns])
+        block = matrix[:, columns]
+        block -= direction[:, None] * (direction @ block)
+        matrix[:, columns] = block
+        sizes[columns] = np.sqrt(np.einsum("ij,ij->j", block, block))
     else:
         rows = np.flatnonzero(direction)
         parts = direction[rows] @ matrix[rows]
         columns = columns[np.flatnonzero(parts[columns])]
         matrix[np.ix_(rows, columns)] -= np.outer(direction[rows], parts[columns])
-    sizes[columns] = np.linalg.norm(matrix[:, columns], axis=0)
+        sizes[columns] = np.linalg.norm(matrix[:, columns], axis=0)

@@ -46,7 +46,7 @@ def loop_wrenches(terms: Terms, multipliers: Array) -> dict[str, Array]:
         Force, N, then moment, N m, by loop. Couplings have none, since they constrain coordinates, not frames.
     """
     mechanism, pose = terms.mechanism, terms.at.pose
-    jacobian, names = mechanism.closure.body_jacobian(pose), [loop for loop, _ in mechanism.closure.names]
+    jacobian, names = terms.at.body_jacobian, [loop for loop, _ in mechanism.closure.names]
     wrenches = {}
     for loop in mechanism.spec.loop:
         frame, other = (mechanism.frames.find(end, loop.name) for end in (loop.frame_a, loop.frame_b))
@@ -84,7 +84,7 @@ def joint_wrenches(
     """
     mechanism, pose = terms.mechanism, terms.at.pose
     tree = mechanism.tree
-    external = np.einsum("r,rjk->jk", multipliers, mechanism.closure.body_jacobian(pose))
+    external = np.einsum("r,rjk->jk", multipliers, terms.at.body_jacobian)
     external += mechanism.springs.body_wrenches(pose, terms.v_tree) + applied
     in_joints = _rotate(_shift_reference(external, pose.translation), pose, to_world=False)
 

@@ -74,9 +74,9 @@ class Draft(Tables):
         MechanismError
             Pinocchio cannot build the tree.
         """
-        text, urdf = merge([TreeText(self.urdf_text(), self.source)])
+        urdf = merge([TreeText(self.urdf_text(), self.source)])
         try:
-            tree = Tree(pin.buildModelFromXML(text))
+            tree = Tree(pin.buildModelFromXML(ElementTree.tostring(urdf.root, encoding="unicode")))
         except MechanismError as error:
             raise MechanismError(f"{self.source}: {error}") from None
         except (ValueError, RuntimeError) as error:

@@ -20,6 +20,7 @@ RESTARTS = 20  # from perturbed guesses
 MAX_ITERATIONS = 100  # of the Gauss-Newton method
 STALL_ITERATIONS = 6  # from a perturbed guess: a smaller decrease of |phi| in so many steps counts as a local minimum
 STALL_DECREASE = 0.01  # relative
+MIN_STEP = 1e-14  # rad, or mechanism sizes: a shorter step is lost in the rounding of a configuration
 EXACT_TOLERANCE = 1e-10  # mechanism sizes: largest |phi| of a closed mechanism whose numbers are exact
 ROUNDED_TOLERANCE = 1e-5  # the same with numbers rounded to six digits in the files: 2.35619 rad is off by 5e-6
 NEARBY_STEP = 0.02  # rad, or mechanism sizes: distance at which the rank near a closed configuration is computed
@@ -140,7 +141,9 @@ def _gauss_newton(
                 break
         part = -_minimum_norm_solution(jacobian() * tree.step_scale, phi)
         longest, step = float(np.abs(part).max(initial=0.0)), part * tree.step_scale
-        scale = min(1.0, MAX_NEWTON_STEP / longest) if longest > 0 else 0.0
+        if longest <= MIN_STEP:
+            break
+        scale = min(1.0, MAX_NEWTON_STEP / longest)
         while scale > 1e-6:
             trial = tree.integrate(q, scale * step)
             phi_trial, jacobian_trial = evaluate(trial)

@@ -16,6 +16,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.continuation import MAX_SEARCH_STEP, follow, is_local, same_branch
+from ckc_pin.mechanism.batch import evaluate_closure
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
 
@@ -346,35 +347,40 @@ def assembly_branches(mechanism: Mechanism, at: Kinematics | None = None) -> lis
         )
     random = np.random.default_rng(0)
     spread = np.where(mechanism.tree.in_metres[z], mechanism.size, np.pi)
+    starts = np.tile(at.q_tree, (BRANCH_STARTS if len(z) else 0, 1))
+    starts[:, mechanism.tree.q_index[z]] += random.uniform(-1.0, 1.0, (len(starts), len(z))) * spread
     branches = [at]
-    for _ in range(BRANCH_STARTS if len(z) else 0):
-        step = np.zeros(mechanism.n)
-        step[z] = random.uniform(-1.0, 1.0, len(z)) * spread
-        closed = _newton_from_afar(at.integrate(step), mechanism.tolerance)
-        if closed is not None and all(_are_distinct(mechanism, closed, other) for other in branches):
-            branches.append(closed)
+    for q_tree in _close_many(at, starts, mechanism.tolerance):
+        if _is_distinct(mechanism, q_tree, np.array([branch.q_tree for branch in branches])):
+            outcome = newton(Kinematics(at.tree, at.closure, at.partition, q_tree), 0.0, mechanism.tolerance)
+            branches += [outcome.at] if outcome.converged else []
     return branches
 
 
-def _newton_from_afar(start: Kinematics, tolerance: float) -> Kinematics | None:
-    """Close the loops by Newton steps on z of limited length; return None if that fails."""
-    at, z = start, start.partition.z
+def _close_many(at: Kinematics, starts: Array, tolerance: float) -> Array:
+    """Close the loops by Newton steps on z of limited length, from all starts (count, nq) together.
+
+    Returns
+    -------
+    (k, nq) array
+        The closed configurations, in the order of their starts.
+    """
+    z, q_tree, is_open = at.partition.z, starts.copy(), np.ones(len(starts), bool)
+    tolerance *= at.tree.tolerance_factor(at.q_tree)
     for _ in range(MAX_SEARCH_STEPS):
-        outcome = newton(at, 0.0, tolerance)
-        if outcome.converged:
-            return outcome.at
-        step = np.zeros(at.tree.n)
-        step[z] = -np.linalg.lstsq(at.phi_z, at.phi, rcond=1e-6)[0]
-        longest = np.abs(step).max()
-        if not np.isfinite(longest) or longest == 0.0:
-            return None
-        at = at.integrate(step * min(1.0, MAX_SEARCH_STEP / longest))
-    return None
+        phi, J = evaluate_closure(at.tree, at.closure, q_tree[is_open])
+        continues = np.abs(phi).max(axis=1, initial=0.0) > tolerance
+        is_open[is_open] = continues
+        if not np.any(is_open):
+            break
+        step = (np.linalg.pinv(J[continues][:, :, z], rtol=1e-6) @ -phi[continues][:, :, None])[:, :, 0]
+        longest = np.abs(step).max(axis=1, keepdims=True, initial=1e-300)
+        q_tree[np.ix_(is_open, at.tree.q_index[z])] += step * np.minimum(1.0, MAX_SEARCH_STEP / longest)
+    return q_tree[~is_open]
 
 
-def _are_distinct(mechanism: Mechanism, a: Kinematics, b: Kinematics) -> bool:
-    """Whether two configurations differ by more than whole turns of joints."""
-    gap: Array = a.q_tree - b.q_tree
-    angles = ~mechanism.tree.in_metres
-    gap[angles] = np.remainder(gap[angles] + np.pi, 2 * np.pi) - np.pi
-    return bool(np.abs(gap).max() > BRANCH_DISTANCE)
+def _is_distinct(mechanism: Mechanism, q_tree: Array, others: Array) -> bool:
+    """Whether a configuration (nq,) differs from others (count, nq) by more than whole turns of joints."""
+    gap, angles = q_tree - others, ~mechanism.tree.in_metres
+    gap[:, angles] = np.remainder(gap[:, angles] + np.pi, 2 * np.pi) - np.pi
+    return bool(np.abs(gap).max(axis=1).min() > BRANCH_DISTANCE)

@@ -76,6 +76,11 @@ class Kinematics:
         rho[self.partition.z] = -self.phi_z_factor.solve(self.phi_q)
         return rho
 
+    @lazy
+    def body_jacobian(self) -> Array:
+        """Derivative of phi with respect to the spatial velocities of the bodies, see `Closure.body_jacobian`."""
+        return self.closure.body_jacobian(self.pose)
+
     def J_dot(self, v: Array) -> Array:
         """Time derivative of J along a tangent velocity v, shape (rows, n)."""
         return self.closure.jacobian_dot(self.pose, Rate(self.pose, v))

@@ -48,7 +48,7 @@ class Frames:
                 self.joints[frame.name] = placed
         self.bodies = list(model.names)
         for link, placed in reversed(self.links.items()):
-            if np.allclose(placed.rotation, np.eye(3)) and not placed.translation.any():
+            if not placed.translation.any() and np.allclose(placed.rotation, np.eye(3)):
                 self.bodies[placed.joint] = link
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Frames:

@@ -68,14 +68,13 @@ class Linkage:
         overrides: Overrides | None = None,
         prescribed: Mapping[str, float] | None = None,
     ) -> None:
-        text, urdf = merge(tree_texts(spec, sources))
+        urdf = merge(tree_texts(spec, sources))
         self.warnings = list(urdf.warnings)
         if overrides:
             spec, warnings = changed(spec, urdf.root, overrides, sources.name)
             self.warnings += warnings
-            text = ElementTree.tostring(urdf.root, encoding="unicode")
         self.spec, self.sources, self.urdf, self.overrides = spec, sources, urdf, dict(overrides or {})
-        model = _build_model(text, sources.name)
+        model = _build_model(ElementTree.tostring(urdf.root, encoding="unicode"), sources.name)
         model.gravity.linear = np.array(spec.gravity)
         self.frames = Frames(model)
         self.size = _characteristic_length(model, self.frames, spec.loop, sources.name)

@@ -18,6 +18,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from xml.etree import ElementTree
 
 import numpy as np
@@ -118,23 +119,15 @@ def parse(text: str, source: str, prefix: str = "") -> UrdfTree:
     return tree
 
 
-def merge(trees: Sequence[TreeText]) -> tuple[str, UrdfTree]:
-    """Parse several trees and merge them into one URDF.
-
-    Returns
-    -------
-    text : str
-        The merged URDF, for Pinocchio.
-    tree : UrdfTree
-        The merged tree, with the couplings and warnings of all trees.
-    """
+def merge(trees: Sequence[TreeText]) -> UrdfTree:
+    """Parse several trees and merge them into one, with the couplings and warnings of all trees."""
     parsed = [parse(t.text, t.source, t.prefix) for t in trees]
     if len(trees) == 1 and _stands_at_origin(trees[0]):
         merged = UrdfTree(ElementTree.Element("robot", name="world"), parsed[0].base)
         _append(merged, trees[0], parsed[0], set(), set())
     else:
         merged = _common_world(trees, parsed)
-    return ElementTree.tostring(merged.root, encoding="unicode"), merged
+    return merged
 
 
 def _common_world(trees: Sequence[TreeText], parsed: Sequence[UrdfTree]) -> UrdfTree:
@@ -235,11 +228,18 @@ def floats(
     text = default if element is None else element.get(attribute, default)
     if text is None:
         raise InputError(f"{where} has no {attribute}")
-    words = text.split()
-    values = [float(word) for word in words if NUMBER.fullmatch(word)]
-    if len(values) != count or len(words) != count or not all(map(math.isfinite, values)):
+    values = _parse_numbers(text)
+    if values is None or len(values) != count:
         raise InputError(f"{where}: {attribute}={text!r} is not {_finite_numbers(count)}")
-    return values
+    return list(values)
+
+
+@lru_cache(maxsize=4096)
+def _parse_numbers(text: str) -> tuple[float, ...] | None:
+    """Return the finite numbers of a text, None if it has anything else. Rebuilt mechanisms repeat most texts."""
+    words = text.split()
+    values = tuple(float(word) for word in words if NUMBER.fullmatch(word))
+    return values if len(values) == len(words) and all(map(math.isfinite, values)) else None
 
 
 def _finite_numbers(count: int) -> str:

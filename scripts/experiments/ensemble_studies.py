@@ -82,7 +82,7 @@ def basin(out: Path, count: int, divisions: int) -> str:
     starts = np.column_stack([data_set[name].to_numpy() for name in names])
     home = (data_set["settled"].to_numpy() == 1.0) & (data_set["status"].to_numpy() == 1)
     inside = _proved(case, proved.safe_level, divisions, starts)
-    map_ = ckc_pin.singularity_map("five_bar")
+    map_ = ckc_pin.singularity_map("five_bar", cells=64)  # curves are as accurate as with more cells
     q = case.mechanism.partition.q
     curves = [_wrap_angles(locus.q_tree[:, q]) for locus in map_.loci if locus.kind != "serial"]
     target = case.controller.q_d

@@ -119,6 +119,8 @@ PHRASES = {
     r"joint changes?": "joint mode, mode transition",
     r"joints' changes": "mode transitions",
 }  # fmt: skip
+_ANY_PHRASE = re.compile("|".join(PHRASES), re.IGNORECASE)
+_MARK = re.compile(r"^\s*(//+|#+|\*)?\s*")
 _PHRASE = {re.compile(rf"(?<![\w-])(?:{phrase})(?![\w-])", re.IGNORECASE): say for phrase, say in PHRASES.items()}
 
 
@@ -143,6 +145,7 @@ def _words(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
 
 
+@cache
 def check_name(name: str, function: bool = False, constant: bool = False, cpp: bool = False) -> str | None:
     """Return what to write instead of an identifier, None where it is good.
 
@@ -166,12 +169,14 @@ def check_name(name: str, function: bool = False, constant: bool = False, cpp: b
 
 def check_prose(text: str) -> list[tuple[int, str, str]]:
     """Return phrases to avoid in a text: (line from 0, phrase, what to write instead)."""
-    lines = text.split("\n")
-    flat = " ".join(re.sub(r"^\s*(//+|#+|\*)?\s*", "", line).rstrip() for line in lines)
+    lines = [_MARK.sub("", line).rstrip() for line in text.split("\n")]
+    flat = " ".join(lines)
+    if not _ANY_PHRASE.search(flat):
+        return []
     starts, at = [], 0
     for line in lines:
         starts.append(at)
-        at += len(re.sub(r"^\s*(//+|#+|\*)?\s*", "", line).rstrip()) + 1
+        at += len(line) + 1
     return [
         (sum(start <= match.start() for start in starts) - 1, match[0], say)
         for phrase, say in _PHRASE.items()

@@ -54,23 +54,21 @@ def files() -> tuple[str, ...]:
 
 
 @cache
-def tree(file: str) -> ast.Module:
-    return ast.parse((ROOT / file).read_text(encoding="utf-8"))
+def identifiers(file: str) -> tuple[list[str], set[tuple[int, str]]]:
+    """Return the public classes at the top of a module, and the lines and names of `names`."""
+    parsed = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    classes = [n.name for n in parsed.body if isinstance(n, ast.ClassDef) and not n.name.startswith("_")]
+    return classes, set(names(parsed))
 
 
 # --- classes ---------------------------------------------------------------------------------------
-
-
-def classes(parsed: ast.Module) -> Iterator[str]:
-    """Names of the public classes at the top of a module."""
-    yield from (n.name for n in parsed.body if isinstance(n, ast.ClassDef) and not n.name.startswith("_"))
 
 
 def test_no_two_public_classes_have_one_name() -> None:
     where = defaultdict(list)
     for file in files():
         if file.startswith(("ckc_pin/", "scripts/experiments/")) and "/tests/" not in file:
-            for name in classes(tree(file)):
+            for name in identifiers(file)[0]:
                 where[name].append(file)
     assert len(where) > 100
     in_package = {name: sum(file.startswith("ckc_pin/") for file in places) for name, places in where.items()}
@@ -84,11 +82,10 @@ def test_no_two_public_classes_have_one_name() -> None:
 def names(parsed: ast.Module) -> Iterator[tuple[int, str]]:
     """Every identifier that a module makes or uses, with its line."""
     for node in ast.walk(parsed):
-        line = getattr(node, "lineno", 0)
+        fields = vars(node)
         for field in ("id", "attr", "arg", "name", "asname"):
-            value = getattr(node, field, None)
-            if isinstance(value, str):
-                yield line, value
+            if isinstance(fields.get(field), str):
+                yield fields.get("lineno", 0), fields[field]
 
 
 def words(name: str) -> list[str]:
@@ -96,6 +93,7 @@ def words(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
 
 
+@cache
 def forbidden(name: str) -> list[str]:
     """What to say instead of the words of a name that are not to be used."""
     return [f"{name}: say {WORDS[FORMS[word]]}" for word in words(name) if word in FORMS]
@@ -116,7 +114,7 @@ def test_no_name_has_a_word_that_another_stands_for(top: str) -> None:
     assert under_top
     faults = [f"{file}: {fault}" for file in under_top for fault in forbidden(Path(file).stem)]
     for file in under_top:
-        faults += [f"{file}:{line}: {fault}" for line, name in names(tree(file)) for fault in forbidden(name)]
+        faults += [f"{file}:{line}: {fault}" for line, name in identifiers(file)[1] for fault in forbidden(name)]
     assert sorted(set(faults)) == []
 
 

@@ -199,14 +199,14 @@ def test_a_callers_controller(formulation: str, sampled: bool) -> None:
         h = 2e-3 * max(0.3, abs(value))
         runs = [
             [simulate("five_bar/swing", {**overrides, name: value + x}, controller=law) for x in (h / s, -h / s)]
-            for s in (1, 2, 4)
+            for s in (1, 2)
         ]
         for part in ("q_tree", "v_tree", "u"):
-            one, two, four = (
+            one, two = (
                 (getattr(more, part) - getattr(less, part)) / (2 * h / s)
-                for (more, less), s in zip(runs, (1, 2, 4), strict=True)
+                for (more, less), s in zip(runs, (1, 2), strict=True)
             )
-            expected = (16 * (4 * four - two) - (4 * two - one)) / 45
+            expected = (4 * two - one) / 3
             assert np.abs(getattr(result, part)[:, :, k] - expected).max() <= 1e-7 * np.abs(expected).max(), (
                 name,
                 part,

@@ -31,8 +31,8 @@ def differences(scene: str, name: str, h: float, overrides: dict[str, Any], part
         assert run.status == "done"
         return np.concatenate([getattr(run, part) for part in parts], axis=1)
 
-    one, two, four = ((value(present + x) - value(present - x)) / (2 * x) for x in (h, h / 2, h / 4))
-    return (16 * (4 * four - two) - (4 * two - one)) / 45
+    one, two = ((value(present + x) - value(present - x)) / (2 * x) for x in (h / 2, h / 4))
+    return (4 * two - one) / 3
 
 
 def _files(scene: Any) -> Any:
@@ -95,13 +95,9 @@ def test_the_start_of_a_free_root(tmp_path: Path) -> None:
     result = sensitivities(scene, [f"initial.q.{name}" for name in names], TIGHT)
     h = 2e-3
     for k, name in enumerate(names):
-        runs = [
-            [simulate(scene, {**TIGHT, f"initial.q.{name}": start[name] + x / s}) for x in (h, -h)] for s in (1, 2, 4)
-        ]
-        one, two, four = (
-            (more.q_tree - less.q_tree) / (2 * h / s) for (more, less), s in zip(runs, (1, 2, 4), strict=True)
-        )
-        expected = ((16 * (4 * four - two) - (4 * two - one)) / 45)[:, :3]
+        runs = [[simulate(scene, {**TIGHT, f"initial.q.{name}": start[name] + x / s}) for x in (h, -h)] for s in (2, 4)]
+        one, two = ((more.q_tree - less.q_tree) / (2 * h / s) for (more, less), s in zip(runs, (2, 4), strict=True))
+        expected = ((4 * two - one) / 3)[:, :3]
         rows = zip(result.run.q_tree, result.q_tree[:, :3, k], strict=True)
         ours = np.array([pin.exp3(q[3:]) @ derivative for q, derivative in rows])
         assert np.abs(ours - expected).max() <= TOLERANCE * np.abs(expected).max(), name

@@ -39,12 +39,10 @@ def agree(scene: str, names: list[str], *, h: float = 5e-4) -> None:
     values = with_components(values_of(mechanism.spec, mechanism.urdf))
     values |= {f"initial.q.{name}": x for name, x in loaded.spec.initial.q.items()}
     for k, name in enumerate(result.parameters):
-        runs = [[simulate(scene, {**TIGHT, name: values[name] + x}).points for x in (h / s, -h / s)] for s in (1, 2, 4)]
+        runs = [[simulate(scene, {**TIGHT, name: values[name] + x}).points for x in (h / s, -h / s)] for s in (2, 4)]
         for point, derivative in result.points.items():
-            one, two, four = (
-                (more[point] - less[point]) / (2 * h / s) for (more, less), s in zip(runs, (1, 2, 4), strict=True)
-            )
-            expected = (16 * (4 * four - two) - (4 * two - one)) / 45
+            one, two = ((more[point] - less[point]) / (2 * h / s) for (more, less), s in zip(runs, (2, 4), strict=True))
+            expected = (4 * two - one) / 3
             assert np.abs(derivative[:, :, k] - expected).max() <= 1e-8 * max(1e-2, np.abs(expected).max()), (
                 name,
                 point,
