@@ -17,7 +17,7 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.validation import suggest_name
 from ckc_pin.errors import InputError
-from ckc_pin.identification.physical import nearest_physical
+from ckc_pin.identification.physical import MIN_WEIGHT, nearest_physical
 from ckc_pin.identification.pseudo_inertia import MOMENTS
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap, inertial_rotation
@@ -122,7 +122,9 @@ class Unknowns:
                 parameters.append(ParameterValue(name, float(values[k]), float(self.start[k]), units[k]))
         return parameters
 
-    def nearest_physical(self, measured: Array, determined: Array, information: Array) -> Array:
+    def nearest_physical(
+        self, measured: Array, determined: Array, information: Array, weight: float = MIN_WEIGHT
+    ) -> Array:
         """Return steps of all unknowns from their start, in typical sizes, to values that some mechanism can have.
 
         See `physical.nearest_physical`.
@@ -130,8 +132,9 @@ class Unknowns:
         in_bodies = {int(k) for at in self.bodies for k in at}
         positive = [k for k, x in enumerate(self.names) if k not in in_bodies and x.rpartition(".")[2] in POSITIVE]
         return nearest_physical(
-            measured, determined, information, self.start, self.scale, self.bodies, np.array(positive, dtype=np.intp)
-        )
+            measured, determined, information, self.start, self.scale, self.bodies, np.array(positive, dtype=np.intp),
+            weight,
+        )  # fmt: skip
 
 
 def total_mass(mechanism: Mechanism) -> float:

@@ -287,11 +287,11 @@ def find_sensitivity_parameters(
     labels = [part for name in names for part in parts_of(name, values)]
     if len(set(labels)) < len(labels):
         raise InputError(f"sensitivities: a parameter is repeated in {', '.join(names)}; name each of them once")
-    parameters = ParameterMap(mechanism, scene.spec.parameters, rebuild)
+    slopes = ParameterMap(mechanism, scene.spec.parameters, rebuild).derivatives(
+        [name for name in labels if is_parameter(name)]
+    )
     return [
-        _mechanism_parameter(mechanism, actuation, name, parameters.derivative(name))
-        if is_parameter(name)
-        else of_scene[name]
+        _mechanism_parameter(mechanism, actuation, name, slopes[name]) if is_parameter(name) else of_scene[name]
         for name in labels
     ]
 
