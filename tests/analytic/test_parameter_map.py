@@ -173,7 +173,7 @@ def test_derivatives_of_all_parameters_equal_those_of_each_alone(all_kinds: Mech
         alone = parameters.derivative(name)
         assert together[name].keys() == alone.keys(), name
         for key, slope in alone.items():
-            assert np.array_equal(together[name][key], slope), (name, key)
+            assert together[name][key] == pytest.approx(slope, rel=1e-12, abs=1e-14), (name, key)
 
 
 def test_given_inertia_is_not_scaled_by_a_mass(all_kinds: Mechanism) -> None:
