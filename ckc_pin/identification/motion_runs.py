@@ -18,7 +18,7 @@ from ckc_pin.control.controllers import RecordedTorques
 from ckc_pin.errors import CkcError, InputError
 from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_spline
 from ckc_pin.identification.records import Record, require_radians
-from ckc_pin.identification.unknowns import ParameterValue, Unknowns
+from ckc_pin.identification.unknowns import LINK_VALUES, ParameterValue, Unknown, Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES
 from ckc_pin.run.prepare import prepare
@@ -27,7 +27,7 @@ from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.scene import Scene
 from ckc_pin.sensitivity.sensitivities import sensitivities
 
-__all__ = ["Motion", "MotionRun", "RunError", "predict", "read_motion", "simulate_with_derivatives"]
+__all__ = ["Motion", "MotionRun", "MotionUnknowns", "RunError", "predict", "read_motion", "simulate_with_derivatives"]
 
 RTOL = 1e-10  # of runs
 
@@ -74,6 +74,25 @@ class MotionRun(Immutable):
     predicted: Array
     by_unknown: Array
     by_start: Array
+
+
+class MotionUnknowns(Unknowns):
+    """Unknowns of runs.
+
+    Attributes
+    ----------
+    directions : (p, r) array
+        Orthonormal directions of the inertial numbers of links, in typical sizes, along which runs are differentiated.
+        The others have no influence on any motion.
+    """
+
+    def __init__(
+        self, mechanism: Mechanism, unknowns: Sequence[Unknown], links: Sequence[str], directions: Array | None
+    ) -> None:
+        super().__init__(mechanism, unknowns, links)
+        inertial = [int(k) for at in self.bodies for k in at]
+        units = np.eye(len(self.names))[:, inertial]
+        self.directions = units if directions is None else units @ directions
 
 
 class RunError(Exception):
@@ -145,7 +164,7 @@ def _interpolated(series: Sequence[tuple[Array, Array]], first: float) -> Record
 # --- runs ------------------------------------------------------------------------------------------
 
 
-def simulate_with_derivatives(unknowns: Unknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> MotionRun:
+def simulate_with_derivatives(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> MotionRun:
     """Simulate a record from a start, with unknowns that are x typical sizes off theirs.
 
     Raises
@@ -155,19 +174,27 @@ def simulate_with_derivatives(unknowns: Unknowns, motion: Motion, x: Array, q: A
     parameters = unknowns.parameters_at(unknowns.start + unknowns.scale * x)
     start = [f"initial.{key}.{name}" for key in ("q", "q_dot") for name in unknowns.mechanism.independent]
     instants, rows = _instants(motion)
+    gradients = np.reshape([p.gradient * unknowns.scale for p in parameters], (len(parameters), -1))
+    count, basis = len(LINK_VALUES) * len(unknowns.links), unknowns.directions
+    inertial, others = parameters[:count], parameters[count:]
+    directions = {
+        f"direction {k}": {p.name: float(c) for p, c in zip(inertial, column, strict=True) if c}
+        for k, column in enumerate((gradients[:count] @ basis).T)
+    }
     try:
         scene = _make_scene(unknowns.mechanism, motion, parameters, q, q_dot, float(instants[-1]))
-        result = sensitivities(scene, [*(p.name for p in parameters), *start], instants=instants)
+        names = [*(p.name for p in others), *start]
+        result = sensitivities(scene, names, instants=instants, directions=directions)
     except CkcError as error:
         raise RunError(str(error)) from error
     predicted = _outputs(result.run, motion, rows)
     slopes = np.array([result[name][rows[:, k]] for k, name in enumerate(motion.names)]).transpose(1, 0, 2)
-    gradients = np.array([p.gradient for p in parameters]).reshape(len(parameters), -1)
-    by_unknown = slopes[:, :, : len(parameters)] @ gradients * unknowns.scale
-    return MotionRun(result.run.q_tree[0], q_dot, predicted, by_unknown, slopes[:, :, len(parameters) :])
+    by_other, by_start, by_direction = np.split(slopes, [len(others), len(names)], axis=2)
+    by_unknown = by_other @ gradients[count:] + by_direction @ basis.T
+    return MotionRun(result.run.q_tree[0], q_dot, predicted, by_unknown, by_start)
 
 
-def predict(unknowns: Unknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> Array:
+def predict(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> Array:
     """Return the measured quantities of a run without derivatives, (m, k) (RunError)."""
     parameters = unknowns.parameters_at(unknowns.start + unknowns.scale * x)
     instants, rows = _instants(motion)

@@ -20,6 +20,7 @@ from ckc_pin.identification.fit import HUBER, LinearFit, fit_linear
 from ckc_pin.identification.motion_runs import (
     Motion,
     MotionRun,
+    MotionUnknowns,
     RunError,
     predict,
     read_motion,
@@ -27,15 +28,17 @@ from ckc_pin.identification.motion_runs import (
 )
 from ckc_pin.identification.physical import MIN_WEIGHT
 from ckc_pin.identification.records import Record
+from ckc_pin.identification.regressor import TorqueRegressor, linear_parameters
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.unknowns import INERTIAL, Unknown, Unknowns, expand_names, moment_unknowns, typical_size
+from ckc_pin.identification.structure import structural_directions
+from ckc_pin.identification.unknowns import INERTIAL, Unknown, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.parameters import with_components
 from ckc_pin.mechanism.units import parameter_unit
 from ckc_pin.run.columns import list_quantities
 
-__all__ = ["identify_motion"]
+__all__ = ["identify_motion", "make_unknowns"]
 
 COLUMN_TOLERANCE = 1e-7  # of the sensitivities' largest singular value: smaller ones are errors of the integration
 LEAK_TOLERANCE = 1e-5  # part of a gradient in directions that are not determined
@@ -60,9 +63,9 @@ def identify_motion(
     mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool
 ) -> Identification:
     """Estimate parameters by fitting runs to measurements (InputError, NumericalError)."""
-    unknowns = _make_unknowns(mechanism, parameters)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
+        unknowns = make_unknowns(mechanism, parameters)
         motions = [read_motion(mechanism, record, warnings) for record in records]
         fitted = [x for x in motions if not x.record.validation]
         count = sum(int(np.sum(np.isfinite(x.values))) for x in fitted)
@@ -104,7 +107,7 @@ def _misfits(prediction: Prediction, motion: Motion) -> Iterator[str]:
             )
 
 
-def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
+def make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> MotionUnknowns:
     """Return the unknowns of names with wildcards (InputError)."""
     parameters = ParameterMap(mechanism)
     values = with_components(parameters.values)
@@ -121,7 +124,12 @@ def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
         else:
             scale = typical_size(mechanism, parameter_unit(mechanism, name))
             unknowns.append(Unknown(name, parameters.value_of(name), scale))
-    return Unknowns(mechanism, unknowns, links)
+    # With other lengths, other combinations of inertial numbers have no influence.
+    is_linear = {name for name in names if not name.endswith(INERTIAL)} <= {*linear_parameters(mechanism, parameters)}
+    directions = None
+    if links and is_linear:
+        directions = structural_directions(TorqueRegressor(mechanism, [f"link.{name}.{INERTIAL}" for name in links]))
+    return MotionUnknowns(mechanism, unknowns, links, directions)
 
 
 def _rms(residual: Array) -> Array:
@@ -138,7 +146,7 @@ class _Fit:
 
     Parameters
     ----------
-    unknowns : Unknowns
+    unknowns : MotionUnknowns
     motions : sequence of Motion
     x : (p,) array
         Steps of the unknowns from their start, in typical sizes, to begin with.
@@ -149,7 +157,7 @@ class _Fit:
     """
 
     def __init__(
-        self, unknowns: Unknowns, motions: Sequence[Motion], x: Array, *, robust: bool, starts_only: bool = False
+        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, starts_only: bool = False
     ) -> None:
         self.unknowns, self.motions, self.x = unknowns, motions, x
         self.robust, self.starts_only = robust, starts_only
