@@ -115,7 +115,7 @@ def make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> MotionUnknow
     singles = [name for name, x in values.items() if not isinstance(x, tuple)]
     singles = [name for name in singles if not name.startswith("link.") or name.split(".")[1] in moving]
     inertial = [f"link.{name}.{INERTIAL}" for name in moving if f"link.{name}.mass" in values]
-    names = expand_names([*inertial, *singles], patterns, "runs have derivatives with respect to")
+    names = expand_names([*inertial, *singles], patterns)
     links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
     unknowns: list[Unknown] = []
     for name in names:

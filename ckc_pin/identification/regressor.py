@@ -55,7 +55,7 @@ class TorqueRegressor(Unknowns):
     def __init__(self, mechanism: Mechanism, names: Sequence[str]) -> None:
         self.mechanism = mechanism
         self.parameters = ParameterMap(mechanism)
-        names = expand_names(linear_parameters(mechanism, self.parameters), names, "torques are linear in")
+        names = expand_names(linear_parameters(mechanism, self.parameters), names)
         links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
         super().__init__(mechanism, [unknown for name in names for unknown in self._unknowns(name)], links)
         model = mechanism.tree.model

@@ -201,7 +201,7 @@ def test_slider_crank_gives_masses_friction_and_a_length():
 BAD = [
     ({"method": "motions"}, 'method: expected "torques" or "motion", got \'motions\''),
     ({"method": "motion", "physical": False}, "simulates runs, which need inertias that some body can have"),
-    ({"parameters": ["motor.*.offset"]}, "runs have derivatives with respect to gravity.x, gravity.y"),
+    ({"parameters": ["motor.*.offset"]}, "there are link.*.inertial, gravity.x, gravity.y"),
     ({"parameters": ["joint.theta_1.fricton"]}, "did you mean 'joint.theta_1.friction'"),
     ({"drop": "theta_3"}, "no column theta_1, theta_3; 2 coordinates and the torques of all motors or of none"),
     ({"drop": "tau.theta_3"}, "no column tau.theta_3; 2 coordinates and the torques of all motors or of none"),
