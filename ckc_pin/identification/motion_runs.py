@@ -67,7 +67,10 @@ class Motion(Immutable):
 
 @dataclass(frozen=True, eq=False)
 class MotionRun(Immutable):
-    """A run from a start (n,) and (d,), and its derivatives by unknown (m, k, p) and by start (m, k, 2 d)."""
+    """A run: coordinates (rows, n), first rates (d,), measured quantities (m, k), and derivatives of these.
+
+    The derivatives are by unknown (m, k, p) and by start (m, k, 2 d).
+    """
 
     q: Array
     q_dot: Array
@@ -191,7 +194,7 @@ def simulate_with_derivatives(unknowns: MotionUnknowns, motion: Motion, x: Array
     slopes = np.array([result[name][rows[:, k]] for k, name in enumerate(motion.names)]).transpose(1, 0, 2)
     by_other, by_start, by_direction = np.split(slopes, [len(others), len(names)], axis=2)
     by_unknown = by_other @ gradients[count:] + by_direction @ basis.T
-    return MotionRun(result.run.q_tree[0], q_dot, predicted, by_unknown, by_start)
+    return MotionRun(result.run.q_tree, q_dot, predicted, by_unknown, by_start)
 
 
 def predict(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> Array:

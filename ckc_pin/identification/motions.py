@@ -16,7 +16,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.identification.fit import HUBER, LinearFit, fit_linear
+from ckc_pin.identification.fit import HUBER, LinearFit, Prior, fit_linear
 from ckc_pin.identification.motion_runs import (
     Motion,
     MotionRun,
@@ -27,10 +27,11 @@ from ckc_pin.identification.motion_runs import (
     simulate_with_derivatives,
 )
 from ckc_pin.identification.physical import MIN_WEIGHT
+from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record
 from ckc_pin.identification.regressor import TorqueRegressor, linear_parameters
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.structure import structural_directions
+from ckc_pin.identification.structure import Advice, structural_directions
 from ckc_pin.identification.unknowns import INERTIAL, Unknown, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
@@ -60,8 +61,9 @@ SUSPICIOUS_RMS = 1e-5  # rad or m: the smallest residual that is worth a warning
 
 
 def identify_motion(
-    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool
-) -> Identification:
+    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool,
+    prior: Mapping[str, float | str],
+) -> Identification:  # fmt: skip
     """Estimate parameters by fitting runs to measurements (InputError, NumericalError)."""
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
@@ -75,11 +77,17 @@ def identify_motion(
                 f"identify: {count} measurements for {needed} unknowns; record a longer motion or estimate less"
             )
         none = np.zeros((len(unknowns.names), 0))
-        fit = _Fit(unknowns, fitted, unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0)), robust=robust)
+        known = make_prior(unknowns, prior)
+        start = unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0))
+        fit = _Fit(unknowns, fitted, start, robust=robust, prior=known)
         fit.solve()
-        others = [_Fit(unknowns, [x], fit.x, robust=robust, starts_only=True) for x in motions if x.record.validation]
+        others = [
+            _Fit(unknowns, [x], fit.x, robust=robust, prior=known, starts_only=True)
+            for x in motions if x.record.validation
+        ]  # fmt: skip
         for other in others:
             other.solve()
+        advice = _advise(unknowns, fitted[0], fit.runs[0])
     predictions = fit.predictions({})
     for prediction, motion in zip(predictions, fitted, strict=True):
         warnings += list(_misfits(prediction, motion))
@@ -91,6 +99,7 @@ def identify_motion(
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
         complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
+        prior=known, advice=advice,
     )  # fmt: skip
 
 
@@ -124,12 +133,31 @@ def make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> MotionUnknow
         else:
             scale = typical_size(mechanism, parameter_unit(mechanism, name))
             unknowns.append(Unknown(name, parameters.value_of(name), scale))
-    # With other lengths, other combinations of inertial numbers have no influence.
-    is_linear = {name for name in names if not name.endswith(INERTIAL)} <= {*linear_parameters(mechanism, parameters)}
     directions = None
-    if links and is_linear:
+    if links and _is_linear(mechanism, names):
         directions = structural_directions(TorqueRegressor(mechanism, [f"link.{name}.{INERTIAL}" for name in links]))
     return MotionUnknowns(mechanism, unknowns, links, directions)
+
+
+def _is_linear(mechanism: Mechanism, names: Sequence[str]) -> bool:
+    """Whether torques are linear in parameters; with lengths, other combinations of inertias have no influence."""
+    single = {name for name in names if not name.endswith(INERTIAL)}
+    return single <= {*linear_parameters(mechanism, ParameterMap(mechanism))}
+
+
+def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice | None:
+    """Return what says which motions would determine parameters, if torques are linear in them."""
+    mechanism = unknowns.mechanism
+    names = [name for name in unknowns.names if ".moment." not in name and ".origin_inertia." not in name]
+    names = [name for name in names if not name.startswith(tuple(f"link.{link}." for link in unknowns.links))]
+    names += [f"link.{link}.{INERTIAL}" for link in unknowns.links]
+    if not _is_linear(mechanism, names):
+        return None
+    q_tree = np.array([mechanism.tree.from_coordinates(q) for q in run.q])
+    torques = [motion.record.values.get(f"tau.{motor}", np.zeros(1)) for motor in mechanism.motors.names]
+    has_torques = any(np.any(np.nan_to_num(tau)) for tau in torques)
+    regressor = TorqueRegressor(mechanism, names)
+    return Advice(regressor, q_tree, unknowns.names, has_torques=has_torques)
 
 
 def _rms(residual: Array) -> Array:
@@ -152,14 +180,16 @@ class _Fit:
         Steps of the unknowns from their start, in typical sizes, to begin with.
     robust : bool
         Whether large residuals have less weight.
+    prior : Prior
     starts_only : bool
         Whether x remains as it is.
     """
 
     def __init__(
-        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, starts_only: bool = False
-    ) -> None:
-        self.unknowns, self.motions, self.x = unknowns, motions, x
+        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, prior: Prior,
+        starts_only: bool = False,
+    ) -> None:  # fmt: skip
+        self.unknowns, self.motions, self.x, self.prior = unknowns, motions, x, prior
         self.robust, self.starts_only = robust, starts_only
         self.starts = [(motion.q, motion.q_dot) for motion in motions]
         self.runs: list[MotionRun] = []
@@ -237,20 +267,20 @@ class _Fit:
         for _ in range(MAX_STEPS):
             stds = [self._stds(k, self.runs[k]) for k in range(len(self.motions))]
             dx, start_steps = self._step(stds)
-            cost, decrease, reason = self._cost([run.predicted for run in self.runs], stds), 0.0, ""
+            cost, decrease, reason = self._cost([run.predicted for run in self.runs], stds, self.x), 0.0, ""
             promised = cost - self._linear_cost(stds, dx, start_steps)
             is_last = promised <= tolerance * cost or self._is_exact()
             for size in (1.0,) if is_last else STEP_SIZES:
                 x = self.x + size * dx
                 starts = [self._moved(run, size * step) for run, step in zip(self.runs, start_steps, strict=True)]
                 try:  # derivatives cost much more than a run, so they are computed for accepted steps only
-                    if self._cost(self._predict(x, starts), stds) >= cost:
+                    if self._cost(self._predict(x, starts), stds, x) >= cost:
                         continue
                     runs = self._simulate(x, starts)
                 except RunError as error:
                     reason = str(error)
                     continue
-                if (decrease := cost - self._cost([run.predicted for run in runs], stds)) > 0:
+                if (decrease := cost - self._cost([run.predicted for run in runs], stds, x)) > 0:
                     self.x, self.starts, self.runs = x, starts, runs
                     break
             if is_last or decrease <= tolerance * cost:
@@ -261,7 +291,7 @@ class _Fit:
 
     def _moved(self, run: MotionRun, start_step: Array) -> tuple[Array, Array]:
         d = len(self.at)
-        q = run.q.copy()
+        q = run.q[0].copy()
         q[self.at] += start_step[:d]
         return q, run.q_dot + start_step[d:]
 
@@ -271,7 +301,7 @@ class _Fit:
             run.predicted + run.by_unknown @ dx + run.by_start @ step
             for run, step in zip(self.runs, start_steps, strict=True)
         ]
-        return self._cost(predicted, stds)
+        return self._cost(predicted, stds, self.x + dx)
 
     def _is_exact(self) -> bool:
         """Whether the residuals are errors of the integration."""
@@ -301,8 +331,10 @@ class _Fit:
         noise = [motion.record.noise.get(name, 0.0) for name in motion.names]
         return np.maximum(np.maximum(estimate, noise), self.floors[k])
 
-    def _cost(self, predicted: Sequence[Array], stds: Sequence[Array]) -> float:
-        return sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
+    def _cost(self, predicted: Sequence[Array], stds: Sequence[Array], x: Array) -> float:
+        rows, target = self.prior
+        known = float(np.sum((rows @ x - target) ** 2))
+        return known + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
 
     def _cost_of(self, motion: Motion, predicted: Array, stds: Array) -> float:
         sizes = np.abs(motion.values - predicted) / stds
@@ -334,7 +366,9 @@ class _Fit:
             columns.append(by_unknown - Q @ (Q.T @ by_unknown))
             rights.append(right - Q @ (Q.T @ right))
         A, b = np.concatenate(columns)[:, None], np.concatenate(rights)[:, None]
-        return fit_linear(A, b, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
+        rows, target = self.prior
+        known = rows, target - rows @ self.x
+        return fit_linear(A, b, known, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
 
     def _step(self, stds: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the steps of the unknowns and of the start of each record."""
