@@ -6,6 +6,7 @@ Every function raises InputError with one sentence: ``function: argument: expect
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from fnmatch import fnmatchcase
 from inspect import signature
 from os import PathLike, fsencode, fspath
 from typing import Any
@@ -22,6 +23,7 @@ __all__ = [
     "find_nearest_name",
     "is_array",
     "is_number",
+    "match_names",
     "require_callable",
     "require_controller_signature",
     "require_flag",
@@ -33,6 +35,7 @@ __all__ = [
 
 SHORT_TYPES = (int, float, complex, str, bytes, type(None), np.generic)  # quoted in messages; others by their type
 MAX_QUOTED = 80  # characters of a value in a message
+VECTOR_AXES = ("x", "y", "z", "rx", "ry", "rz")
 MIN_SIMILARITY = 0.65  # of an unknown name and a valid one, from 0 to 1, for "did you mean"
 
 
@@ -177,6 +180,37 @@ def suggest_name(name: Any, names: Iterable[Any]) -> str:
         return ""
     is_similar = find_nearest_name(name, [nearest], MIN_SIMILARITY) or nearest.endswith(f".{name}")
     return f"; did you mean {nearest!r}?" if is_similar else f"; the nearest is {nearest!r}"
+
+
+def match_names(pattern: Any, names: Iterable[str], where: str) -> list[str]:
+    """Return the names that a pattern with the wildcards ``*``, ``?`` and ``[...]`` stands for, in their order.
+
+    The name of a vector stands for its components, which end in ``.x`` and so on.
+
+    Raises
+    ------
+    InputError
+        No name matches. The message lists vectors and numbers, with ``*`` in place of what carries them.
+    """
+    names = list(names)
+    matches = [name for name in names if isinstance(pattern, str) and _matches(name, pattern)]
+    if not matches:
+        kinds = ", ".join(dict.fromkeys(_kind(name) for name in names)) or "none"
+        raise InputError(f"{where}: nothing is called {pattern!r:.80}; there are {kinds}{suggest_name(pattern, names)}")
+    return matches
+
+
+def _matches(name: str, pattern: str) -> bool:
+    vector, _, axis = name.rpartition(".")
+    return fnmatchcase(name, pattern) or (axis in VECTOR_AXES and fnmatchcase(vector, pattern))
+
+
+def _kind(name: str) -> str:
+    root, _, rest = name.partition(".")
+    key = rest.partition(".")[2]
+    vector, _, axis = key.rpartition(".")
+    key = vector if axis in VECTOR_AXES and vector else key
+    return f"{root}.*.{key}" if key else name
 
 
 def _fold_case(name: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +15,15 @@ from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.tables import to_data_frame
 from ckc_pin.base.toml_writer import write_toml
-from ckc_pin.base.validation import describe_value, is_number, require_path, require_table, require_type, suggest_name
+from ckc_pin.base.validation import (
+    describe_value,
+    is_number,
+    match_names,
+    require_path,
+    require_table,
+    require_type,
+    suggest_name,
+)
 from ckc_pin.errors import InputError
 from ckc_pin.identification.calibration_fit import RANK_TOLERANCE, Fit, Readings
 from ckc_pin.identification.calibration_geometry import Geometry
@@ -31,7 +38,7 @@ from ckc_pin.identification.estimates import (
 from ckc_pin.identification.records import read_csv
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import AXES, ROOTS, parts_of, require_known, split_name, values_of, with_components
+from ckc_pin.mechanism.parameters import AXES, ROOTS, parts_of, split_component, split_name, values_of, with_components
 
 if TYPE_CHECKING:
     import pandas
@@ -282,23 +289,9 @@ def _expand(mechanism: Mechanism, parameters: Any, readings: Readings) -> tuple[
     names: dict[str, None] = {}
     for pattern in patterns:
         require_type(pattern, str, "calibrate: parameters", expected)
-        matches = [
-            name
-            for name in (*single, *encoders)
-            if any(fnmatchcase(x, pattern) for x in (name, name.rpartition(".")[0]))
-        ]
-        if not matches and pattern in with_components(values):
+        if pattern in with_components(values) and not _is_geometric(split_component(pattern)[0]):
             raise InputError(f"calibrate: parameters: {pattern} has no influence on positions; leave it out")
-        if not matches and pattern.startswith("encoder."):
-            there = ", ".join(encoders) or "none, because poses have readings of points only"
-            raise InputError(
-                f"calibrate: parameters: no {pattern!r}; there are {there}{suggest_name(pattern, encoders)}"
-            )
-        if not matches and "*" not in pattern:
-            require_known([pattern], with_components(geometric), "calibrate: parameters", (*ROOTS, "encoder"))
-        if not matches:
-            raise InputError(f"calibrate: parameters: {pattern!r} matches no geometric parameter; nothing to calibrate")
-        names |= dict.fromkeys(matches)
+        names |= dict.fromkeys(match_names(pattern, (*single, *encoders), "calibrate: parameters"))
     chosen = [k for name, k in encoders.items() if name in names]
     return [name for name in names if name not in encoders], np.array(chosen, dtype=np.intp)
 
@@ -313,16 +306,10 @@ def _by_name(values: Any, names: Sequence[str], key: str) -> Array:
     require_table(values, f"calibrate: {key}", "a table of standard deviations by name")
     array = np.full(len(names), np.inf)
     for pattern, value in values.items():
-        matches = [
-            k for k, name in enumerate(names) if fnmatchcase(name, pattern) or name.rpartition(".")[0] == pattern
-        ]
-        if not matches:
-            raise InputError(
-                f"calibrate: {key}: no {pattern!r}; there are {', '.join(names)}{suggest_name(pattern, names)}"
-            )
+        matches = match_names(pattern, names, f"calibrate: {key}")
         if not is_number(value) or not 0 < value < np.inf:
             raise InputError(f"calibrate: {key}: {pattern} = {value!r:.80}: expected a positive number")
-        array[matches] = value
+        array[[name in matches for name in names]] = value
     return array
 
 

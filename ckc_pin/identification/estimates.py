@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["BY_PRIOR", "IDENTIFIED", "IN_COMBINATION", "NOT_IDENTIFIABLE", "Combination", "Estimate"]
+__all__ = ["BY_PRIOR", "IDENTIFIED", "IN_COMBINATION", "NOT_IDENTIFIABLE", "PRIOR_ONLY", "VERDICTS", "Combination",
+           "Estimate"]  # fmt: skip
 
-# verdicts
-IDENTIFIED, BY_PRIOR = "identified", "identified with a prior"
+IDENTIFIED, BY_PRIOR, PRIOR_ONLY = "identified", "identified with a prior", "prior only"
 IN_COMBINATION, NOT_IDENTIFIABLE = "only in a combination", "not identifiable"
+VERDICTS = (IDENTIFIED, BY_PRIOR, PRIOR_ONLY, IN_COMBINATION, NOT_IDENTIFIABLE)
 
 
 @dataclass(frozen=True)
@@ -20,17 +21,21 @@ class Estimate:
     Attributes
     ----------
     value, std : float or None
-        None if they do not determine it.
+        None if neither they nor a prior determine it.
     start : float
         Value in the mechanism's files; of an offset 0.
     verdict : str
-        "identified", "identified with a prior", "only in a combination" or "not identifiable".
+        "identified", "identified with a prior", "prior only" (the measurements add nothing), "only in a combination" or
+        "not identifiable".
+    missing : str or None
+        Without a value, why, and which motion would tell it.
     """
 
     value: float | None
     std: float | None
     start: float
     verdict: str
+    missing: str | None = None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -15,7 +14,7 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.tables import to_csv_text, to_data_frame
-from ckc_pin.base.validation import is_number, require_table, suggest_name
+from ckc_pin.base.validation import is_number, match_names, require_table
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.identification.excitation_problem import (
@@ -465,12 +464,7 @@ def _make_limits(mechanism: Mechanism, table: Mapping[str, float | Sequence[floa
     choices = names[:-2]
     for pattern, limit in table.items():
         where = f"excite: limits: {pattern}"
-        matches = [k for k, name in enumerate(choices) if fnmatchcase(name, pattern)]
-        if not matches:
-            raise InputError(
-                f"{where}: no such quantity{suggest_name(pattern, choices)}; there are COORDINATE, v.COORDINATE, "
-                f"a.COORDINATE, tau.MOTOR and speed.MOTOR of {', '.join(coordinates)}"
-            )
+        matches = [choices.index(name) for name in match_names(pattern, choices, "excite: limits")]
         is_pair = isinstance(limit, Sequence) and len(limit) == 2 and all(map(is_number, limit))
         is_coordinate = matches[0] < len(coordinates)
         if not is_pair and (is_coordinate or not is_number(limit) or limit <= 0):  # type: ignore[operator]

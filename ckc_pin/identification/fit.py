@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
 
-__all__ = ["LinearFit", "fit_linear"]
+__all__ = ["LinearFit", "Prior", "fit_linear", "no_prior"]
+
+Prior = tuple[Array, Array]  # equations (k, p) and right-hand sides (k,), both in standard deviations
 
 STRUCTURAL_RANK_TOLERANCE = 1e-10  # of the largest singular value: smaller ones are rounding
 MAX_STD = 0.5  # of a determined direction, in typical sizes
@@ -39,6 +42,8 @@ class LinearFit(Immutable):
         Orthonormal basis of the determined directions.
     information : (r,) array
         Inverse standard deviations along these directions for independent residuals.
+    by_data : (p, k) array
+        Orthonormal basis of the directions that are determined without the prior.
     influence : (m, r, d) array
         Derivatives of the solution along the determined directions with respect to the right-hand sides.
     residual : (m, d) array
@@ -56,6 +61,7 @@ class LinearFit(Immutable):
     covariance: Array
     determined: Array
     information: Array
+    by_data: Array
     influence: Array
     residual: Array
     noise: Array
@@ -69,21 +75,28 @@ class LinearFit(Immutable):
         return replace(self, covariance=covariance)
 
     def combinations(self, tolerance: float) -> tuple[IntArray, Array]:
-        """Return one unknown for each determined direction, and coefficients (r, p) of what is determined.
+        """Return one unknown for each direction that data determine, and coefficients (k, p) of what they determine.
 
         Each combination contains its own unknown with coefficient 1, and none of the other chosen ones. Coefficients
         below `tolerance` of the largest one, in typical sizes, are rounding.
         """
-        order, _ = pivoted_columns((self.determined * self.information).T)
-        chosen = np.sort(order[: self.determined.shape[1]])
-        coefficients = np.linalg.solve(self.determined[chosen].T, self.determined.T)
+        along = self.by_data.T @ self.determined
+        order, _ = pivoted_columns(along * self.information @ self.determined.T)
+        chosen = np.sort(order[: self.by_data.shape[1]])
+        coefficients = np.linalg.solve(self.by_data[chosen].T, self.by_data.T)
         largest = np.abs(coefficients).max(axis=1, initial=0.0, keepdims=True)
         return chosen, np.where(np.abs(coefficients) > tolerance * largest, coefficients, 0.0)
 
 
+def no_prior(p: int) -> Prior:
+    """Return a prior of p unknowns that says nothing."""
+    return np.zeros((0, p)), np.zeros(0)
+
+
 def fit_linear(
-    columns: Array, right: Array, *, robust: bool = False, noise: Array | None = None, smallest: float = 0.0
-) -> LinearFit:
+    columns: Array, right: Array, prior: Prior, *, robust: bool = False, noise: Array | None = None,
+    smallest: float = 0.0,
+) -> LinearFit:  # fmt: skip
     """Solve columns x = right, (m, d, p) and (m, d), by iteratively reweighted least squares.
 
     The d equations of one instant are weighted by the inverse covariance of their residuals, which is estimated. With
@@ -91,6 +104,8 @@ def fit_linear(
 
     Parameters
     ----------
+    prior : pair of (k, p) and (k,) arrays
+        Equations of unit variance that are known beforehand.
     noise : (m, d, d) array, optional
         Covariances of the equations that are known; estimated if absent.
     smallest : float
@@ -100,54 +115,80 @@ def fit_linear(
     floor = NOISE_FLOOR * max(float(np.abs(right).max(initial=0.0)), 1e-300)
     weights, covariance = np.ones(m), np.eye(d)
     x = np.zeros(p)
-    for _ in range(MAX_PASSES):
+    for k in range(MAX_PASSES):
         whitening = np.linalg.inv(np.linalg.cholesky(covariance if noise is None else noise))
         A = (whitening @ columns) * np.sqrt(weights)[:, None, None]
         b = np.einsum("...ij,...j->...i", whitening, right) * np.sqrt(weights)[:, None]
-        u, s, v = np.linalg.svd(A.reshape(-1, p), full_matrices=False)
-        rank = int(np.sum(s > max(STRUCTURAL_RANK_TOLERANCE * float(s[0]), smallest, 1e-300)))
-        previous, x = x, v[:rank].T @ ((u[:, :rank].T @ b.ravel()) / s[:rank])
+        svd = _Svd.of(A, b, prior, smallest)
+        previous, x = x, svd.solve(svd.rank)
         residual = right - columns @ x
         if robust:
             sizes = np.linalg.norm(np.einsum("...ij,...j->...i", whitening, residual), axis=1) / np.sqrt(d)
             scale = max(float(np.median(sizes)) / 0.6745, 1e-300) if noise is None else 1.0
             weights = np.minimum(1.0, HUBER * scale / np.maximum(sizes, 1e-300))
         if noise is None:
-            used = weights.sum() - rank / d
+            used = weights.sum() - float(np.sum(svd.u[: m * d, : svd.rank] ** 2)) / d
             covariance = np.einsum("k,ki,kj->ij", weights, residual, residual) / max(used, 1.0) + floor**2 * np.eye(d)
         is_final = noise is not None and not robust
         if is_final or (
-            np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and _ > 1
+            np.linalg.norm(x - previous) <= PASS_TOLERANCE * max(float(np.linalg.norm(x)), 1e-300) and k > 1
         ):
             break
     return _solution(
-        A, b, u, s, v, rank, residual, covariance if noise is None else noise.mean(axis=0), whitening, weights
+        A, b, svd, prior, residual, covariance if noise is None else noise.mean(axis=0), whitening, weights, smallest
     )
 
 
+class _Svd(NamedTuple):
+    """Singular value decomposition of weighted equations, with those of a prior below, and their right-hand side."""
+
+    u: Array
+    s: Array
+    v: Array
+    right: Array
+    rank: int
+
+    @classmethod
+    def of(cls, A: Array, b: Array, prior: Prior, smallest: float) -> _Svd:
+        rows, target = prior
+        u, s, v = np.linalg.svd(np.vstack([A.reshape(-1, A.shape[2]), rows]), full_matrices=False)
+        rank = int(np.sum(s > max(STRUCTURAL_RANK_TOLERANCE * float(s[0]), smallest, 1e-300)))
+        return cls(u, s, v, np.concatenate([b.ravel(), target]), rank)
+
+    def solve(self, count: int) -> Array:
+        """Return the solution in the directions of the `count` largest singular values."""
+        return np.asarray(self.v[:count].T @ ((self.u[:, :count].T @ self.right) / self.s[:count]))
+
+    @property
+    def determined(self) -> int:
+        """Number of directions with a small standard deviation."""
+        return int(np.sum(self.s[: self.rank] > 1.0 / MAX_STD))
+
+
 def _solution(
-    A: Array, b: Array, u: Array, s: Array, v: Array, rank: int, residual: Array, noise: Array, whitening: Array,
-    weights: Array,
+    A: Array, b: Array, svd: _Svd, prior: Prior, residual: Array, noise: Array, whitening: Array, weights: Array,
+    smallest: float,
 ) -> LinearFit:  # fmt: skip
     """Keep the determined directions, and estimate the covariance of x."""
-    p = A.shape[2]
-    keep = int(np.sum(s[:rank] > 1.0 / MAX_STD))
-    basis = v[:keep].T
-    x = basis @ ((u[:, :keep].T @ b.ravel()) / s[:keep])
-    whitened = b - A @ (v[:rank].T @ ((u[:, :rank].T @ b.ravel()) / s[:rank]))
+    p, keep, s = A.shape[2], svd.determined, svd.s
+    basis = svd.v[:keep].T
+    by_data = _Svd.of(A, b, no_prior(p), smallest) if len(prior[0]) else svd
+    whitened = b - A @ svd.solve(svd.rank)
     lag = _correlation_time(whitened)
     scores = np.einsum("kdp,kd->kp", A @ basis, whitened)
     meat = np.diag(s[:keep] ** 2)
     if lag:
-        meat = scores.T @ scores
+        meat = scores.T @ scores + (prior[0] @ basis).T @ (prior[0] @ basis)
         for k in range(1, lag + 1):
             product = scores[k:].T @ scores[:-k]
             meat += (1 - k / (lag + 1)) * (product + product.T)
     inside = meat / np.outer(s[:keep] ** 2, s[:keep] ** 2)
     condition = float(s[0] / s[keep - 1]) if keep else float("inf")
     influence = ((A @ basis) * np.sqrt(weights)[:, None, None] / s[:keep] ** 2).swapaxes(1, 2) @ whitening
-    return LinearFit(x, basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep], influence, residual,
-                     noise, lag, condition, rank)  # fmt: skip
+    return LinearFit(
+        svd.solve(keep), basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep],
+        by_data.v[: by_data.determined].T, influence, residual, noise, lag, condition, svd.rank,
+    )  # fmt: skip
 
 
 def _correlation_time(residual: Array) -> int:

@@ -32,6 +32,7 @@ def identify(
     method: str = "torques",
     physical: bool = True,
     robust: bool = False,
+    prior: Mapping[str, float | str] | None = None,
 ) -> Identification:
     """Estimate parameters from measured coordinates and motor torques.
 
@@ -59,6 +60,9 @@ def identify(
         Whether inertias have to be those of a body that can exist. Runs need such inertias.
     robust : bool
         Whether instants with large residuals have less weight (Huber).
+    prior : mapping, optional
+        Standard deviations of start values by parameter, with wildcards, in SI units or as parts:
+        ``{"link.*.mass": "5 %", "joint.hip.damping": 0.01}``.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def identify(
         for group, for_validation in ((data, False), (validation, True))
         for x in (read_record(part, mechanism) for part in _as_list(group))
     ]
-    return _identify(method, mechanism, records, parameters, physical=physical, robust=robust)
+    return _identify(method, mechanism, records, parameters, physical=physical, robust=robust, prior=prior or {})
 
 
 def identify_file(path: str | Path) -> Identification:
@@ -85,8 +89,9 @@ def identify_file(path: str | Path) -> Identification:
     mechanism, records = load_task(spec, Path(path).parent)
     estimate = spec.estimate
     return _identify(
-        estimate.method, mechanism, records, estimate.parameters, physical=estimate.physical, robust=estimate.robust
-    )
+        estimate.method, mechanism, records, estimate.parameters, physical=estimate.physical, robust=estimate.robust,
+        prior=estimate.prior,
+    )  # fmt: skip
 
 
 def load_task(spec: IdentifySpec, folder: Path) -> tuple[Mechanism, list[Record]]:
@@ -103,15 +108,15 @@ def _as_list(data: Any) -> list[Any]:
 
 def _identify(
     method: str, mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, physical: bool,
-    robust: bool,
+    robust: bool, prior: Mapping[str, float | str],
 ) -> Identification:  # fmt: skip
     if all(record.validation for record in records):
         raise InputError("identify: data: every record is for validation; at least one has to be fitted")
     if method == "torques":
-        return identify_torques(mechanism, records, parameters, physical=physical, robust=robust)
+        return identify_torques(mechanism, records, parameters, physical=physical, robust=robust, prior=prior)
     if not physical:
         raise InputError(
             'identify: physical: method = "motion" simulates runs, which need inertias that some body can '
             "have; remove physical = false"
         )
-    return identify_motion(mechanism, records, parameters, robust=robust)
+    return identify_motion(mechanism, records, parameters, robust=robust, prior=prior)

@@ -10,39 +10,37 @@ what remains says what the data determine of the parameters, as for torques:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, Immutable, IntArray
-from ckc_pin.base.linear_algebra import one_blas_thread, pivoted_columns
-from ckc_pin.control.controllers import RecordedTorques
-from ckc_pin.errors import CkcError, InputError, NumericalError
-from ckc_pin.identification.fit import HUBER, LinearFit, fit_linear
-from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_spline
-from ckc_pin.identification.records import Record, require_radians
-from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.unknowns import (
-    INERTIAL,
-    ParameterValue,
-    Unknown,
-    Unknowns,
-    expand_names,
-    moment_unknowns,
-    typical_size,
+from ckc_pin.base.arrays import Array
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.identification.fit import HUBER, LinearFit, Prior, fit_linear
+from ckc_pin.identification.motion_runs import (
+    Motion,
+    MotionRun,
+    MotionUnknowns,
+    RunError,
+    predict,
+    read_motion,
+    simulate_with_derivatives,
 )
+from ckc_pin.identification.physical import MIN_WEIGHT
+from ckc_pin.identification.priors import make_prior
+from ckc_pin.identification.records import Record
+from ckc_pin.identification.regressor import TorqueRegressor, linear_parameters
+from ckc_pin.identification.result import Identification, Prediction, make_result
+from ckc_pin.identification.structure import Advice, structural_directions
+from ckc_pin.identification.unknowns import INERTIAL, Unknown, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
-from ckc_pin.mechanism.parameters import AXES, with_components
+from ckc_pin.mechanism.parameters import with_components
 from ckc_pin.mechanism.units import parameter_unit
 from ckc_pin.run.columns import list_quantities
-from ckc_pin.scene.scene import Scene
-from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
 
-__all__ = ["identify_motion"]
+__all__ = ["identify_motion", "make_unknowns"]
 
-RTOL = 1e-10  # of runs
 COLUMN_TOLERANCE = 1e-7  # of the sensitivities' largest singular value: smaller ones are errors of the integration
 LEAK_TOLERANCE = 1e-5  # part of a gradient in directions that are not determined
 NOISE_FLOOR = 1e-9  # of the size of a coordinate: smaller residuals are errors of the integration
@@ -50,7 +48,10 @@ EXACT = 10.0  # residuals up to so many of these floors need no smaller ones
 MAX_STEPS = 60
 STEP_SIZES = 0.5 ** np.arange(11)  # parts of a Gauss-Newton step that are tried
 COST_TOLERANCE = 1e-5  # relative: a smaller decrease of the cost ends the fit
-FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records
+FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records, and for the first weights
+# Of the distance of inertias from their start values, one after the other: steps that are far from the minimum would
+# otherwise take directions that are hardly determined to absurd inertias.
+PRIOR_WEIGHTS = (1e-1, 1e-2, 1e-3, MIN_WEIGHT)
 PROMISING = 1e-3  # part of the cost by which the linear model says that it can still decrease
 MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 HORIZONS = (0.1, 0.3)  # parts of the records that are fitted first, where runs from the start values leave the data
@@ -59,62 +60,15 @@ SUSPICIOUS = 3.0  # residual in units of the noise of a quantity's spline
 SUSPICIOUS_RMS = 1e-5  # rad or m: the smallest residual that is worth a warning
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion(Immutable):
-    """One record, and what its runs need.
-
-    Attributes
-    ----------
-    names : list of str
-        Measured quantities.
-    t : (m, k) array
-        Times of the values, from the start of the run, s.
-    values : (m, k) array
-        NaN marks gaps.
-    controller : RecordedTorques or None
-    q, q_dot : (n,) and (d,) arrays
-        First guess of the start.
-    splines : mapping of str to SplineFit
-        Of the coordinates that gave it.
-    """
-
-    record: Record
-    names: list[str]
-    t: Array
-    values: Array
-    controller: RecordedTorques | None
-    q: Array
-    q_dot: Array
-    splines: Mapping[str, SplineFit]
-
-    def until(self, part: float) -> _Motion:
-        """Return the first part of the record."""
-        return replace(self, values=np.where(self.t <= part * np.nanmax(self.t), self.values, np.nan))
-
-
-@dataclass(frozen=True, eq=False)
-class _Run(Immutable):
-    """A run from a start (n,) and (d,), and its derivatives by unknown (m, k, p) and by start (m, k, 2 d)."""
-
-    q: Array
-    q_dot: Array
-    predicted: Array
-    by_unknown: Array
-    by_start: Array
-
-
-class _RunError(Exception):
-    """A run did not reach the last measurement, or its mechanism cannot be built; its cause is what is wrong."""
-
-
 def identify_motion(
-    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool
-) -> Identification:
+    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, robust: bool,
+    prior: Mapping[str, float | str],
+) -> Identification:  # fmt: skip
     """Estimate parameters by fitting runs to measurements (InputError, NumericalError)."""
-    unknowns = _make_unknowns(mechanism, parameters)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
-        motions = [_read_motion(mechanism, record, warnings) for record in records]
+        unknowns = make_unknowns(mechanism, parameters)
+        motions = [read_motion(mechanism, record, warnings) for record in records]
         fitted = [x for x in motions if not x.record.validation]
         count = sum(int(np.sum(np.isfinite(x.values))) for x in fitted)
         needed = len(unknowns.names) + 2 * mechanism.d * len(fitted)
@@ -123,11 +77,17 @@ def identify_motion(
                 f"identify: {count} measurements for {needed} unknowns; record a longer motion or estimate less"
             )
         none = np.zeros((len(unknowns.names), 0))
-        fit = _Fit(unknowns, fitted, unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0)), robust=robust)
+        known = make_prior(unknowns, prior)
+        start = unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0))
+        fit = _Fit(unknowns, fitted, start, robust=robust, prior=known)
         fit.solve()
-        others = [_Fit(unknowns, [x], fit.x, robust=robust, starts_only=True) for x in motions if x.record.validation]
+        others = [
+            _Fit(unknowns, [x], fit.x, robust=robust, prior=known, starts_only=True)
+            for x in motions if x.record.validation
+        ]  # fmt: skip
         for other in others:
             other.solve()
+        advice = _advise(unknowns, fitted[0], fit.runs[0])
     predictions = fit.predictions({})
     for prediction, motion in zip(predictions, fitted, strict=True):
         warnings += list(_misfits(prediction, motion))
@@ -139,10 +99,11 @@ def identify_motion(
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
         complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
+        prior=known, advice=advice,
     )  # fmt: skip
 
 
-def _misfits(prediction: Prediction, motion: _Motion) -> Iterator[str]:
+def _misfits(prediction: Prediction, motion: Motion) -> Iterator[str]:
     """Yield warnings about residuals that are much larger than the noise which the splines see."""
     for name, spline in motion.splines.items():
         k = prediction.quantities.index(name)
@@ -155,7 +116,7 @@ def _misfits(prediction: Prediction, motion: _Motion) -> Iterator[str]:
             )
 
 
-def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
+def make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> MotionUnknowns:
     """Return the unknowns of names with wildcards (InputError)."""
     parameters = ParameterMap(mechanism)
     values = with_components(parameters.values)
@@ -163,7 +124,7 @@ def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
     singles = [name for name, x in values.items() if not isinstance(x, tuple)]
     singles = [name for name in singles if not name.startswith("link.") or name.split(".")[1] in moving]
     inertial = [f"link.{name}.{INERTIAL}" for name in moving if f"link.{name}.mass" in values]
-    names = expand_names([*inertial, *singles], patterns, "runs have derivatives with respect to")
+    names = expand_names([*inertial, *singles], patterns)
     links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
     unknowns: list[Unknown] = []
     for name in names:
@@ -172,121 +133,31 @@ def _make_unknowns(mechanism: Mechanism, patterns: Sequence[str]) -> Unknowns:
         else:
             scale = typical_size(mechanism, parameter_unit(mechanism, name))
             unknowns.append(Unknown(name, parameters.value_of(name), scale))
-    return Unknowns(mechanism, unknowns, links)
+    directions = None
+    if links and _is_linear(mechanism, names):
+        directions = structural_directions(TorqueRegressor(mechanism, [f"link.{name}.{INERTIAL}" for name in links]))
+    return MotionUnknowns(mechanism, unknowns, links, directions)
 
 
-# --- records ---------------------------------------------------------------------------------------
+def _is_linear(mechanism: Mechanism, names: Sequence[str]) -> bool:
+    """Whether torques are linear in parameters; with lengths, other combinations of inertias have no influence."""
+    single = {name for name in names if not name.endswith(INERTIAL)}
+    return single <= {*linear_parameters(mechanism, ParameterMap(mechanism))}
 
 
-def _read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> _Motion:
-    """Return a record with the torques of its run, and estimate its start."""
-    coordinates = [name for name in mechanism.coordinates if name in record.values]
-    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
-    missing = [name for name in torques if name not in record.values]
-    if len(coordinates) < mechanism.d or 0 < len(missing) < len(torques):
-        required = mechanism.independent if len(coordinates) < mechanism.d else missing
-        raise InputError(
-            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torques of "
-            f"all motors or of none are needed, there are {', '.join(record.values) or 'none'}"
-        )
-    estimated = next((name for name, delay in record.delay.items() if isinstance(delay, str)), None)
-    if estimated is not None:
-        raise InputError(
-            f'identify: {record.source}: delay: {estimated}: method = "torques" estimates delays; give the delay in s'
-        )
-    if missing:
-        warnings.append(f"{record.source}: no torques were recorded, so the motors count as unpowered")
-    require_radians(mechanism, record, coordinates)
-    names = [name for name, x in record.values.items() if name not in torques and np.isfinite(x).any()]
-    t = np.array([record.times(name) for name in names]).T
-    values = np.array([record.values[name] for name in names]).T
-    series = {} if missing else {name: _measured(record, name) for name in torques}
-    begin, end = (max((x[0] for x, _ in series.values()), default=-np.inf),
-                  min((x[-1] for x, _ in series.values()), default=np.inf))  # fmt: skip
-    outside = np.isfinite(values) & ((t < begin) | (t > end))
-    if outside.any():
-        warnings.append(
-            f"{record.source}: {outside.sum()} values before the first or after the last torque are left out"
-        )
-    values = np.where(outside, np.nan, values)
-    first = float(t[np.isfinite(values)].min(initial=np.inf))
-    chosen = list(mechanism.independent)
-    if not set(chosen) <= set(coordinates):
-        at = mechanism.tree.indices(tuple(coordinates), "identify: data")
-        order, _ = pivoted_columns(mechanism.assembled.rho[at].T)
-        chosen = [coordinates[k] for k in np.sort(order[: mechanism.d])]
-    splines = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in chosen}
-    q, q_dot = estimate_start(mechanism, splines, first)
-    controller = _interpolated(list(series.values()), first) if series else None
-    return _Motion(record, names, t - first, values, controller, q, q_dot, splines)
-
-
-def _measured(record: Record, name: str) -> tuple[Array, Array]:
-    """Return times and values of a torque without gaps (InputError)."""
-    measured = np.isfinite(record.values[name])
-    if measured.sum() < 2:
-        raise InputError(f"identify: {record.source}: {name} has no values; give the torque, 0 if there is none")
-    return record.times(name)[measured], record.values[name][measured]
-
-
-def _interpolated(series: Sequence[tuple[Array, Array]], first: float) -> RecordedTorques:
-    """Return torques over time from the first measurement on, interpolated linearly, also over gaps."""
-    times = np.unique(np.concatenate([[first], *(times for times, _ in series)]))
-    times = times[times >= first]
-    columns = [np.interp(times, *one) for one in series]
-    return RecordedTorques(times - first, np.array(columns).T, interpolates=True)
-
-
-# --- runs ------------------------------------------------------------------------------------------
-
-
-def _simulate(unknowns: Unknowns, motion: _Motion, x: Array, q: Array, q_dot: Array) -> _Run:
-    """Simulate a record from a start, with derivatives.
-
-    Raises
-    ------
-    _RunError
-    """
+def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice | None:
+    """Return what says which motions would determine parameters, if torques are linear in them."""
     mechanism = unknowns.mechanism
-    parameters = unknowns.parameters_at(unknowns.start + unknowns.scale * x)
-    start = [f"initial.{key}.{name}" for key in ("q", "q_dot") for name in mechanism.independent]
-    measured = np.isfinite(motion.values)
-    instants, where = np.unique(np.append(motion.t[measured], 0.0), return_inverse=True)
-    try:
-        scene = Scene(
-            mechanism, t_end=max(float(instants[-1]), 1e-9), formulation="dae", controller=motion.controller,
-            initial={"q": dict(zip(mechanism.coordinates, q.tolist(), strict=True)),
-                     "q_dot": dict(zip(mechanism.independent, q_dot.tolist(), strict=True))},
-            parameters=_overrides(mechanism, parameters), solver={"rtol": RTOL, "atol": RTOL / 10},
-        )  # fmt: skip
-        result = sensitivities(scene, [*(p.name for p in parameters), *start], instants=instants)
-    except CkcError as error:
-        raise _RunError(str(error)) from error
-    if result.run.status != "done":
-        raise _RunError(f"the run {result.run.message}")
-    index = np.zeros(motion.values.shape, dtype=np.intp)
-    index[measured] = where[:-1]
-    predicted, slopes = _outputs(result, motion.names, index)
-    gradients = np.array([p.gradient for p in parameters]).reshape(len(parameters), -1)
-    by_unknown = slopes[:, :, : len(parameters)] @ gradients * unknowns.scale
-    return _Run(result.run.q_tree[0], q_dot, predicted, by_unknown, slopes[:, :, len(parameters) :])
-
-
-def _overrides(mechanism: Mechanism, parameters: Sequence[ParameterValue]) -> dict[str, Any]:
-    """Return the values of parameters, as vectors where the mechanism was built with this vector."""
-    values: dict[str, Any] = {p.name: p.value for p in parameters}
-    for name, vector in mechanism.overrides.items():
-        components = [f"{name}.{axis}" for axis in AXES]
-        if isinstance(vector, tuple) and any(x in values for x in components):
-            values[name] = tuple(values.pop(x, old) for x, old in zip(components, vector, strict=True))
-    return values
-
-
-def _outputs(result: Sensitivities, names: Sequence[str], index: IntArray) -> tuple[Array, Array]:
-    """Return the measured quantities of a run (m, k) at given rows, and their derivatives (m, k, parameters)."""
-    columns = [result.run[name][index[:, k]] for k, name in enumerate(names)]
-    slopes = [result[name][index[:, k]] for k, name in enumerate(names)]
-    return np.array(columns).T, np.array(slopes).transpose(1, 0, 2)
+    names = [name for name in unknowns.names if ".moment." not in name and ".origin_inertia." not in name]
+    names = [name for name in names if not name.startswith(tuple(f"link.{link}." for link in unknowns.links))]
+    names += [f"link.{link}.{INERTIAL}" for link in unknowns.links]
+    if not _is_linear(mechanism, names):
+        return None
+    q_tree = np.array([mechanism.tree.from_coordinates(q) for q in run.q])
+    torques = [motion.record.values.get(f"tau.{motor}", np.zeros(1)) for motor in mechanism.motors.names]
+    has_torques = any(np.any(np.nan_to_num(tau)) for tau in torques)
+    regressor = TorqueRegressor(mechanism, names)
+    return Advice(regressor, q_tree, unknowns.names, has_torques=has_torques)
 
 
 def _rms(residual: Array) -> Array:
@@ -303,23 +174,26 @@ class _Fit:
 
     Parameters
     ----------
-    unknowns : Unknowns
-    motions : sequence of _Motion
+    unknowns : MotionUnknowns
+    motions : sequence of Motion
     x : (p,) array
         Steps of the unknowns from their start, in typical sizes, to begin with.
     robust : bool
         Whether large residuals have less weight.
+    prior : Prior
     starts_only : bool
         Whether x remains as it is.
     """
 
     def __init__(
-        self, unknowns: Unknowns, motions: Sequence[_Motion], x: Array, *, robust: bool, starts_only: bool = False
-    ) -> None:
-        self.unknowns, self.motions, self.x = unknowns, motions, x
+        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, prior: Prior,
+        starts_only: bool = False,
+    ) -> None:  # fmt: skip
+        self.unknowns, self.motions, self.x, self.prior = unknowns, motions, x, prior
         self.robust, self.starts_only = robust, starts_only
         self.starts = [(motion.q, motion.q_dot) for motion in motions]
-        self.runs: list[_Run] = []
+        self.runs: list[MotionRun] = []
+        self.weight = PRIOR_WEIGHTS[0]  # of the distance of inertias from their start values
         self.rank = 0  # number of combinations of the unknowns that the data determine
         mechanism, quantities = unknowns.mechanism, list_quantities(unknowns.mechanism)
         self.at = mechanism.tree.indices(mechanism.independent, "identify")
@@ -352,21 +226,27 @@ class _Fit:
                 f"identify: {whole[0].record.source}: no run from the start values reaches the last measurement: "
                 f"{error}; give better start values, or a shorter span"
             )
-        if reason := self._iterate(COST_TOLERANCE):
+        if reason := self._fit_whole():
             raise NumericalError(
                 f"identify: the fit of runs did not converge: {reason}; the rms residuals are {self._rms_residuals()}; "
                 "give better start values, or a shorter span"
             )
 
-    def _begin(self) -> _RunError | None:
+    def _begin(self) -> RunError | None:
         try:
             self.runs = self._simulate(self.x, self.starts)
-        except _RunError as error:
+        except RunError as error:
             return error
         return None
 
-    def _simulate(self, x: Array, starts: Sequence[tuple[Array, Array]]) -> list[_Run]:
-        return [_simulate(self.unknowns, motion, x, *start) for motion, start in zip(self.motions, starts, strict=True)]
+    def _simulate(self, x: Array, starts: Sequence[tuple[Array, Array]]) -> list[MotionRun]:
+        return [
+            simulate_with_derivatives(self.unknowns, motion, x, *start)
+            for motion, start in zip(self.motions, starts, strict=True)
+        ]
+
+    def _predict(self, x: Array, starts: Sequence[tuple[Array, Array]]) -> list[Array]:
+        return [predict(self.unknowns, motion, x, *start) for motion, start in zip(self.motions, starts, strict=True)]
 
     def _is_lost(self) -> bool:
         for motion, run in zip(self.motions, self.runs, strict=True):
@@ -375,44 +255,53 @@ class _Fit:
                 return True
         return False
 
+    def _fit_whole(self) -> str:
+        """Fit the whole records, with less and less weight of the start values; return why that failed, or ""."""
+        reason = ""
+        for self.weight in PRIOR_WEIGHTS:
+            reason = self._iterate(COST_TOLERANCE if self.weight == PRIOR_WEIGHTS[-1] else FIRST_COST_TOLERANCE)
+        return reason
+
     def _iterate(self, tolerance: float) -> str:
         """Take steps until the cost no longer decreases, and return why it is no minimum, "" if it is one."""
         for _ in range(MAX_STEPS):
             stds = [self._stds(k, self.runs[k]) for k in range(len(self.motions))]
             dx, start_steps = self._step(stds)
-            cost, decrease, reason = self._cost(self.runs, stds), 0.0, ""
+            cost, decrease, reason = self._cost([run.predicted for run in self.runs], stds, self.x), 0.0, ""
             promised = cost - self._linear_cost(stds, dx, start_steps)
             is_last = promised <= tolerance * cost or self._is_exact()
             for size in (1.0,) if is_last else STEP_SIZES:
                 x = self.x + size * dx
                 starts = [self._moved(run, size * step) for run, step in zip(self.runs, start_steps, strict=True)]
-                try:
+                try:  # derivatives cost much more than a run, so they are computed for accepted steps only
+                    if self._cost(self._predict(x, starts), stds, x) >= cost:
+                        continue
                     runs = self._simulate(x, starts)
-                except _RunError as error:
+                except RunError as error:
                     reason = str(error)
-                else:
-                    if (decrease := cost - self._cost(runs, stds)) > 0:
-                        self.x, self.starts, self.runs = x, starts, runs
-                        break
+                    continue
+                if (decrease := cost - self._cost([run.predicted for run in runs], stds, x)) > 0:
+                    self.x, self.starts, self.runs = x, starts, runs
+                    break
             if is_last or decrease <= tolerance * cost:
                 return (
                     "" if promised <= PROMISING * cost or is_last else reason or "no step makes the residuals smaller"
                 )
         return f"{MAX_STEPS} steps were not enough"
 
-    def _moved(self, run: _Run, start_step: Array) -> tuple[Array, Array]:
+    def _moved(self, run: MotionRun, start_step: Array) -> tuple[Array, Array]:
         d = len(self.at)
-        q = run.q.copy()
+        q = run.q[0].copy()
         q[self.at] += start_step[:d]
         return q, run.q_dot + start_step[d:]
 
     def _linear_cost(self, stds: Sequence[Array], dx: Array, start_steps: Sequence[Array]) -> float:
         """Return the cost after a step by the linear model."""
-        runs = [
-            replace(run, predicted=run.predicted + run.by_unknown @ dx + run.by_start @ step)
+        predicted = [
+            run.predicted + run.by_unknown @ dx + run.by_start @ step
             for run, step in zip(self.runs, start_steps, strict=True)
         ]
-        return self._cost(runs, stds)
+        return self._cost(predicted, stds, self.x + dx)
 
     def _is_exact(self) -> bool:
         """Whether the residuals are errors of the integration."""
@@ -426,7 +315,7 @@ class _Fit:
             texts += [f"{name} {x:.3g}" for name, x in zip(motion.names, rms, strict=True)]
         return ", ".join(texts)
 
-    def _stds(self, k: int, run: _Run) -> Array:
+    def _stds(self, k: int, run: MotionRun) -> Array:
         """Return the standard deviations by which a record's residuals are divided, (quantities,)."""
         motion = self.motions[k]
         residual = motion.values - run.predicted
@@ -442,11 +331,13 @@ class _Fit:
         noise = [motion.record.noise.get(name, 0.0) for name in motion.names]
         return np.maximum(np.maximum(estimate, noise), self.floors[k])
 
-    def _cost(self, runs: Sequence[_Run], stds: Sequence[Array]) -> float:
-        return sum(self._cost_of(*parts) for parts in zip(self.motions, runs, stds, strict=True))
+    def _cost(self, predicted: Sequence[Array], stds: Sequence[Array], x: Array) -> float:
+        rows, target = self.prior
+        known = float(np.sum((rows @ x - target) ** 2))
+        return known + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
 
-    def _cost_of(self, motion: _Motion, run: _Run, stds: Array) -> float:
-        sizes = np.abs(motion.values - run.predicted) / stds
+    def _cost_of(self, motion: Motion, predicted: Array, stds: Array) -> float:
+        sizes = np.abs(motion.values - predicted) / stds
         if self.robust:
             sizes = np.sqrt(np.where(sizes > HUBER, 2 * HUBER * sizes - HUBER**2, sizes**2))
         cost = float(np.nansum(sizes**2))
@@ -475,7 +366,9 @@ class _Fit:
             columns.append(by_unknown - Q @ (Q.T @ by_unknown))
             rights.append(right - Q @ (Q.T @ right))
         A, b = np.concatenate(columns)[:, None], np.concatenate(rights)[:, None]
-        return fit_linear(A, b, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
+        rows, target = self.prior
+        known = rows, target - rows @ self.x
+        return fit_linear(A, b, known, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
 
     def _step(self, stds: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the steps of the unknowns and of the start of each record."""
@@ -483,7 +376,8 @@ class _Fit:
         if not self.starts_only:
             fit = self.linear(stds)
             self.rank = fit.determined.shape[1]
-            dx = self.unknowns.nearest_physical(self.x + fit.x, fit.determined, fit.information) - self.x
+            x = self.unknowns.nearest_physical(self.x + fit.x, fit.determined, fit.information, self.weight)
+            dx = x - self.x
         start_steps: list[Array] = []
         for k, std in enumerate(stds):
             by_unknown, by_start, right = self._equations(k, std)

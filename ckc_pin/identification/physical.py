@@ -14,22 +14,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.errors import NumericalError
 from ckc_pin.identification.pseudo_inertia import basis
 
-__all__ = ["nearest_physical"]
+__all__ = ["MIN_WEIGHT", "nearest_physical"]
 
 MAX_INFORMATION = 1e3  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
-WEIGHTS = (1e-1, 1e-3, 1e-5, 1e-7)  # of the divergence, one after the other
-MAX_STEPS, STEP_TOLERANCE = 500, 1e-12
+MAX_INFORMATION = 1e6  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
+MIN_WEIGHT = 1e-4  # of the divergence: moves what is measured by some 1e-4 of its standard deviation
+WEIGHTS = 10.0 ** np.arange(-1.0, -4.1, -0.5)  # one after the other; larger ratios take many more Newton steps in all
+MAX_STEPS = 300  # of Newton's method, for each weight; each of them is feasible and better than the one before
+CENTRED, CONVERGED = 0.25, 1e-12  # largest decrement at the end of a weight, and of the last one, in weights
+ROUNDING = 1e-14  # relative to the value: a smaller decrease cannot be seen
+MIN_DECREASE, MIN_LENGTH = 0.1, 1e-6  # of a step, relative to the decrease of the quadratic model and to its length
 MIN_EIGENVALUE = 1e-6  # of a prior, relative to its largest in typical sizes: links without mass
+MASSLESS_WEIGHT = 1e-3  # of the divergence of such links, relative: their masses can grow to what is measured
+MIN_COLUMN = 1e-6  # makes steps of unknowns zero that neither the measurements nor a divergence determine
 
 
 def nearest_physical(
     measured: Array, determined: Array, information: Array, start: Array, scale: Array, bodies: Sequence[IntArray],
-    positive: IntArray,
+    positive: IntArray, weight: float,
 ) -> Array:  # fmt: skip
     """Return all unknowns, in typical sizes, as steps from their start values.
 
@@ -47,86 +54,101 @@ def nearest_physical(
         Unknowns that are the inertial numbers of a link.
     positive : index array
         Unknowns that cannot be negative, such as friction.
-
-    Raises
-    ------
-    NumericalError
-        Newton's method does not converge.
+    weight : float
+        Of the divergence.
     """
-    rows = (determined * np.minimum(information, MAX_INFORMATION)).T
-    terms = [_Divergence(at, start, scale) for at in bodies]
-    x = np.zeros(len(start))
-    for term in terms:
-        x[term.at] = term.first - start[term.at] / scale[term.at]
-    prior = np.maximum(start[positive] / scale[positive], 1e-3)
-    x[positive] = prior - start[positive] / scale[positive]
-    for weight in WEIGHTS:
+    problem = _Problem(measured, (determined * np.minimum(information, MAX_INFORMATION)).T, start / scale, positive)
+    problem.add_bodies(bodies, start, scale)
+    x = problem.prior
+    for w in (*WEIGHTS[1.01 * weight < WEIGHTS], weight):
+        tolerance = CONVERGED if w == weight else CENTRED
         for _ in range(MAX_STEPS):
-            value, gradient, hessian = _objective(x, rows, measured, terms, positive, prior, start / scale, weight)
-            step = -np.linalg.solve(hessian, gradient)
-            if -gradient @ step <= STEP_TOLERANCE * weight:
+            value = problem.value(x, w)
+            matrix, residual = problem.newton_equations(x, w)
+            Q, R = np.linalg.qr(matrix)
+            slope = Q.T @ residual
+            step, decrement = -solve_triangular(R, slope), float(slope @ slope)
+            if decrement <= max(tolerance * w, ROUNDING * abs(value)):
                 break
             length = 1.0
-            while length > 1e-10:
-                trial = x + length * step
-                if _objective(trial, rows, measured, terms, positive, prior, start / scale, weight)[0] < value:
+            while length > MIN_LENGTH:
+                if problem.value(x + length * step, w) <= value - MIN_DECREASE * length * decrement:
                     break
                 length /= 2
-            else:
-                break  # the decrease is below rounding
             x = x + length * step
-        else:
-            raise NumericalError(
-                "identify: no physically consistent parameters were found; Newton's method did not converge"
-            )
     return x
 
 
-class _Divergence:
-    """d(P, P_0) of one link, of its numbers in typical sizes."""
+class _Problem:
+    """The objective of `nearest_physical` in typical sizes: weighted squares, divergences and the positive numbers.
 
-    def __init__(self, at: IntArray, start: Array, scale: Array) -> None:
-        self.at = at
-        unit = np.sqrt(scale[at[[4, 4, 4, 0]]])  # kg^(1/2) m, and kg^(1/2)
-        self.basis = basis() * scale[at][:, None, None] / np.outer(unit, unit)
-        self.offset = np.einsum("i,ijk->jk", start[at] / scale[at], self.basis)
+    Parameters
+    ----------
+    measured : (p,) array
+    rows : (r, p) array
+        Determined directions, weighted.
+    start : (p,) array
+    positive : index array
+
+    Attributes
+    ----------
+    prior : (p,) array
+        The step that the divergence is measured from.
+    """
+
+    def __init__(self, measured: Array, rows: Array, start: Array, positive: IntArray) -> None:
+        self.measured, self.rows, self.positive = measured, rows, positive
+        self.first, self.sizes = start[positive], np.maximum(start[positive], 1e-3)
+        self.prior = np.zeros(len(start))
+        self.prior[positive] = self.sizes - self.first
+
+    def add_bodies(self, bodies: Sequence[IntArray], start: Array, scale: Array) -> None:
+        """Add the divergence of links, whose ten numbers have these indices."""
+        self.at = np.reshape(bodies, (-1, 10)).astype(np.intp)
+        bound = {*self.at.ravel().tolist(), *self.positive.tolist()}
+        self.free = MIN_COLUMN * np.eye(len(start))[[k for k in range(len(start)) if k not in bound]]
+        unit = np.sqrt(scale[self.at[:, [4, 4, 4, 0]]])  # kg^(1/2) m, and kg^(1/2)
+        self.basis = basis() * scale[self.at][..., None, None] / (unit[:, None, :, None] * unit[:, None, None, :])
+        self.offset = np.einsum("li,lijk->ljk", (start / scale)[self.at], self.basis)
         values, axes = np.linalg.eigh(self.offset)
-        values = np.maximum(values, MIN_EIGENVALUE * max(float(values[-1]), 1.0))
-        prior = (axes * values) @ axes.T
-        self.inverse = np.linalg.inv(prior)
-        self.first = np.linalg.lstsq(self.basis.reshape(10, 16).T, prior.ravel(), rcond=None)[0]
+        smallest = MIN_EIGENVALUE * np.maximum(values[:, -1], 1.0)
+        is_small, values = values[:, 0] < smallest, np.maximum(values, smallest[:, None])
+        priors = (axes * values[:, None, :]) @ axes.swapaxes(1, 2)
+        self.inverse = np.linalg.inv(priors)
+        self.shares = np.where(is_small, MASSLESS_WEIGHT, 1.0)  # of the weight, by link
+        for at, one, prior, offset in zip(self.at, self.basis, priors, self.offset, strict=True):
+            self.prior[at] = np.linalg.lstsq(one.reshape(10, 16).T, (prior - offset).ravel(), rcond=None)[0]
 
-    def evaluate(self, x: Array) -> tuple[float, Array, Array] | None:
-        """Return value, gradient and Hessian at a step (10,); None if the body cannot exist."""
-        P = self.offset + np.einsum("i,ijk->jk", x, self.basis)
+    def _pseudo_inertias(self, x: Array) -> Array:
+        return self.offset + np.einsum("li,lijk->ljk", x[self.at], self.basis)
+
+    def value(self, x: Array, weight: float) -> float:
+        """Return the objective at a step (p,), infinite if a body cannot exist."""
+        P, numbers, off = self._pseudo_inertias(x), self.first + x[self.positive], self.rows @ (x - self.measured)
+        if np.any(numbers <= 0):
+            return np.inf
         try:
-            L = np.linalg.cholesky(P)
+            diagonal = np.diagonal(np.linalg.cholesky(P), axis1=1, axis2=2)
         except np.linalg.LinAlgError:
-            return None
-        slopes = np.linalg.solve(P, self.basis)
-        value = float(np.sum(self.inverse * P)) - 2 * float(np.sum(np.log(np.diag(L))))
-        gradient = np.einsum("jk,ijk->i", self.inverse, self.basis) - np.trace(slopes, axis1=1, axis2=2)
-        return value, gradient, np.einsum("ajk,bkj->ab", slopes, slopes)
+            return np.inf
+        divergence = self.shares @ (np.sum(self.inverse * P, axis=(1, 2)) - 2 * np.sum(np.log(diagonal), axis=1))
+        return float(0.5 * off @ off + weight * (divergence + np.sum(numbers / self.sizes - np.log(numbers))))
 
+    def newton_equations(self, x: Array, weight: float) -> tuple[Array, Array]:
+        """Return M and r: the gradient of the objective is M^T r, and its Hessian M^T M.
 
-def _objective(
-    x: Array, rows: Array, measured: Array, terms: Sequence[_Divergence], positive: IntArray, prior: Array,
-    start: Array, weight: float,
-) -> tuple[float, Array, Array]:  # fmt: skip
-    off = rows @ (x - measured)
-    value, gradient, hessian = 0.5 * float(off @ off), rows.T @ off, rows.T @ rows
-    hessian += 1e-12 * np.eye(len(x))
-    for term in terms:
-        part = term.evaluate(x[term.at])
-        if part is None:
-            return np.inf, gradient, hessian
-        value += weight * part[0]
-        gradient[term.at] += weight * part[1]
-        hessian[np.ix_(term.at, term.at)] += weight * part[2]
-    numbers = start[positive] + x[positive]
-    if np.any(numbers <= 0):
-        return np.inf, gradient, hessian
-    value += weight * float(np.sum(numbers / prior - np.log(numbers)))
-    gradient[positive] += weight * (1 / prior - 1 / numbers)
-    hessian[positive, positive] += weight / numbers**2
-    return value, gradient, hessian
+        With P = L L^T, the Hessian of the divergence is J^T J for J = L^-1 dP L^-T, and its gradient is
+        J^T (L^T P_0^-1 L - 1). A solution in these factors keeps twice the digits.
+        """
+        p, bodies, root, roots = len(x), len(self.at), weight**0.5, (weight * self.shares)[:, None] ** 0.5
+        L = np.linalg.cholesky(self._pseudo_inertias(x))
+        left = np.linalg.solve(L[:, None], self.basis)
+        factors = np.linalg.solve(L[:, None], left.swapaxes(2, 3)).reshape(bodies, 10, 16).swapaxes(1, 2)
+        of_bodies = np.zeros((bodies, 16, p))
+        np.put_along_axis(of_bodies, np.repeat(self.at[:, None], 16, axis=1), factors, axis=2)
+        numbers = self.first + x[self.positive]
+        of_positive = np.eye(p)[self.positive] / numbers[:, None]
+        rows = (self.rows, (roots[:, :, None] * of_bodies).reshape(-1, p), root * of_positive, self.free)
+        off = roots * (L.swapaxes(1, 2) @ self.inverse @ L - np.eye(4)).reshape(bodies, 16)
+        residual = (self.rows @ (x - self.measured), off.ravel(), root * (numbers / self.sizes - 1), self.free @ x)
+        return np.vstack(rows), np.concatenate(residual)

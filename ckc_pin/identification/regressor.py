@@ -26,7 +26,7 @@ from ckc_pin.mechanism.parameter_map import ParameterMap
 from ckc_pin.mechanism.springs import Springs
 from ckc_pin.mechanism.units import motor_units, parameter_unit
 
-__all__ = ["TorqueRegressor"]
+__all__ = ["TorqueRegressor", "linear_parameters"]
 
 _LINEAR = {("joint", "friction"), ("joint", "damping"), ("joint", "armature"), ("spring", "stiffness"),
            ("spring", "damping"), ("force", "value"), ("motor", "rotor_inertia"), ("link", "mass")}  # fmt: skip
@@ -55,7 +55,7 @@ class TorqueRegressor(Unknowns):
     def __init__(self, mechanism: Mechanism, names: Sequence[str]) -> None:
         self.mechanism = mechanism
         self.parameters = ParameterMap(mechanism)
-        names = expand_names(_candidates(mechanism, self.parameters), names, "torques are linear in")
+        names = expand_names(linear_parameters(mechanism, self.parameters), names)
         links = [name.split(".")[1] for name in names if name.endswith(f".{INERTIAL}")]
         super().__init__(mechanism, [unknown for name in names for unknown in self._unknowns(name)], links)
         model = mechanism.tree.model
@@ -165,7 +165,7 @@ def _dynamic_parameters(slopes: Mapping[str, Array], joint: int) -> Array:
                      inertia[0, 2], inertia[1, 2], inertia[2, 2]])  # fmt: skip
 
 
-def _candidates(mechanism: Mechanism, parameters: ParameterMap) -> Iterator[str]:
+def linear_parameters(mechanism: Mechanism, parameters: ParameterMap) -> Iterator[str]:
     """Yield the names of all parameters in which the torques are linear."""
     for name in parameters.values:
         root, _, rest = name.partition(".")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +15,19 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError
-from ckc_pin.identification.estimates import IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE, Combination, Estimate
-from ckc_pin.identification.fit import LinearFit
+from ckc_pin.identification.estimates import (
+    BY_PRIOR,
+    IDENTIFIED,
+    IN_COMBINATION,
+    NOT_IDENTIFIABLE,
+    PRIOR_ONLY,
+    VERDICTS,
+    Combination,
+    Estimate,
+)
+from ckc_pin.identification.fit import LinearFit, Prior
 from ckc_pin.identification.pseudo_inertia import pseudo_inertia
+from ckc_pin.identification.structure import Advice
 from ckc_pin.identification.unknowns import Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -24,6 +35,9 @@ if TYPE_CHECKING:
     from ckc_pin.view.inline import Figures
 
 __all__ = ["Identification", "Prediction", "Residual", "make_result"]
+
+UNCHANGED = 0.98  # standard deviation, relative to the prior's, with which the data add nothing to it
+MAX_MISFIT = 0.1  # of a gradient that follows from the equations of the prior, which are linearized at other values
 
 
 @dataclass(frozen=True)
@@ -91,13 +105,15 @@ class Identification(HasSummary):
     values : mapping of str to float
         A complete set of parameter values: measured ones, and for the rest those closest to the start values.
     covariance : (k, k) array
-        Of the k parameters that are identified, in their order.
+        Of the k parameters with a value, in their order.
     instants : int
     warnings : tuple of str
     motions : tuple of Prediction
         Measured and predicted quantities of each record.
     method : str
         "torques" or "motion".
+    missing : tuple of str
+        What would tell each combination that some motion determines, but these data do not.
     """
 
     mechanism: Mechanism
@@ -113,11 +129,12 @@ class Identification(HasSummary):
     warnings: tuple[str, ...]
     motions: tuple[Prediction, ...]
     method: str
+    missing: tuple[str, ...]
 
     @property
     def identified(self) -> list[str]:
-        """Names of the parameters that the data determine."""
-        return [name for name, x in self.parameters.items() if x.verdict == IDENTIFIED]
+        """Names of the parameters with a value, which the data or a prior determine."""
+        return [name for name, x in self.parameters.items() if x.value is not None]
 
     def plot(self) -> Figures:
         """Draw measured and predicted quantities, residuals, and the correlation of the parameters."""
@@ -147,7 +164,9 @@ class Identification(HasSummary):
         for name, value in self.values.items():
             if name not in offsets:
                 estimate = self.parameters[name]
-                note = f"  # std {estimate.std:.3g}" if estimate.std is not None else f"  # {estimate.verdict}"
+                std = "" if estimate.std is None else f"std {estimate.std:.3g}"
+                notes = [std, "" if estimate.verdict == IDENTIFIED else estimate.verdict]
+                note = f"  # {', '.join(filter(None, notes))}"
                 lines.append(f'"{name}" = {value!r}{note}')
         lines += [
             f"# {name} = {self.values[name]!r}, of the measurement, no parameter of the mechanism" for name in offsets
@@ -158,10 +177,15 @@ class Identification(HasSummary):
     def summary(self) -> Summary:
         """Return what was identified, with standard deviations, and the residuals."""
         rows: list[Row] = []
-        for verdict in (IDENTIFIED, IN_COMBINATION, NOT_IDENTIFIABLE):
-            names = [_describe(name, x) for name, x in self.parameters.items() if x.verdict == verdict]
-            rows += [(verdict, names)] if names else []
-        rows.append(("base", f"{len(self.base)} combinations, condition number {self.condition:.3g}"))
+        for verdict in VERDICTS:
+            group = {name: x for name, x in self.parameters.items() if x.verdict == verdict}
+            for missing in dict.fromkeys(x.missing for x in group.values()):
+                names = [_describe(name, x) for name, x in group.items() if x.missing == missing]
+                rows.append((verdict, [*([f"{missing}:"] if missing else []), *names]))
+        of = f" of {len(self.base) + len(self.missing)} that some motion determines" if self.missing else ""
+        rows.append(("base", f"{len(self.base)} combinations{of}, condition number {self.condition:.3g}"))
+        counts = Counter(text.replace(" it", " another", 1) for text in self.missing)
+        rows += [("missing", f"{text}{f' ({count} times)' if count > 1 else ''}") for text, count in counts.items()]
         for label, residuals in (("residuals", self.residuals), ("validation", self.validation)):
             texts = [f"{name}: rms {x.rms:.3g}, expected {x.expected:.3g}" for name, x in residuals.items()]
             rows += [(label, texts)] if texts else []
@@ -174,10 +198,11 @@ class Identification(HasSummary):
             "name": self.mechanism.name,
             "method": self.method,
             "parameters": {
-                name: {"value": x.value, "std": x.std, "start": x.start, "verdict": x.verdict}
+                name: {"value": x.value, "std": x.std, "start": x.start, "verdict": x.verdict, "missing": x.missing}
                 for name, x in self.parameters.items()
             },
             "base": [x.to_dict() for x in self.base],
+            "missing": list(self.missing),
             "condition": self.condition,
             "residuals": {name: {"rms": x.rms, "expected": x.expected} for name, x in self.residuals.items()},
             "validation": {name: {"rms": x.rms, "expected": x.expected} for name, x in self.validation.items()},
@@ -190,7 +215,7 @@ class Identification(HasSummary):
 
 def make_result(
     method: str, unknowns: Unknowns, fit: LinearFit, values: Array, motions: Sequence[Prediction], *, leak: float,
-    complete: bool, instants: int, warnings: Sequence[str],
+    complete: bool, instants: int, warnings: Sequence[str], prior: Prior, advice: Advice | None,
 ) -> Identification:  # fmt: skip
     """Return the result of a fit.
 
@@ -202,23 +227,30 @@ def make_result(
         Part of a parameter's gradient that may lie in directions which are not determined, up to rounding.
     complete : bool
         Whether the values are those of a mechanism that can exist.
+    prior : Prior
+    advice : Advice or None
+        Says which motion would determine a parameter; None if the measurements are not linear in the parameters.
     """
     covariance = fit.covariance * np.outer(unknowns.scale, unknowns.scale)
-    determined = fit.determined
     estimates: dict[str, Estimate] = {}
     slopes: list[Array] = []
     parameters = unknowns.parameters_at(values)
     for x in parameters:
         gradient = x.gradient * unknowns.scale
-        inside = determined @ (determined.T @ gradient)
-        whole = max(float(np.linalg.norm(gradient)), 1e-300)
-        if np.linalg.norm(gradient - inside) <= leak * whole:
+        if _split(gradient, fit.determined)[1] <= leak:
             std = max(float(x.gradient @ covariance @ x.gradient), 0.0) ** 0.5
-            estimates[x.name] = Estimate(x.value, std, x.start, IDENTIFIED)
+            is_measured = _split(gradient, fit.by_data)[1] <= leak
+            verdict = IDENTIFIED if is_measured else _name_prior(gradient, std, prior)
+            estimates[x.name] = Estimate(x.value, std, x.start, verdict)
             slopes.append(x.gradient)
+            continue
+        is_combined = _split(gradient, fit.by_data)[0] > leak
+        if advice is not None:
+            missing = advice.explain(gradient, fit.by_data)
         else:
-            verdict = IN_COMBINATION if np.linalg.norm(inside) > leak * whole else NOT_IDENTIFIABLE
-            estimates[x.name] = Estimate(None, None, x.start, verdict)
+            missing = "other parameters have the same influence" if is_combined else "it has no influence here"
+        verdict = IN_COMBINATION if is_combined else NOT_IDENTIFIABLE
+        estimates[x.name] = Estimate(None, None, x.start, verdict, missing)
     gradients = np.reshape(slopes, (len(slopes), len(values)))
     is_physical = all(np.linalg.eigvalsh(pseudo_inertia(values[at]))[0] > 0 for at in unknowns.bodies)
     fitted, others = ([x for x in motions if x.validation == validation] for validation in (False, True))
@@ -226,7 +258,22 @@ def make_result(
         unknowns.mechanism, estimates, _combinations(unknowns, fit, values, leak), fit.condition,
         _residuals(fitted), _residuals(others), is_physical, {x.name: x.value for x in parameters} if complete else {},
         gradients @ covariance @ gradients.T, instants, tuple(warnings), tuple(motions), method,
+        tuple(advice.explain_rest(fit.by_data)) if advice else (),
     )  # fmt: skip
+
+
+def _split(gradient: Array, basis: Array) -> tuple[float, float]:
+    """Return the parts of a gradient inside and outside of a space with this orthonormal basis, from 0 to 1."""
+    inside, size = basis @ (basis.T @ gradient), max(float(np.linalg.norm(gradient)), 1e-300)
+    return float(np.linalg.norm(inside)) / size, float(np.linalg.norm(gradient - inside)) / size
+
+
+def _name_prior(gradient: Array, std: float, prior: Prior) -> str:
+    """Return the verdict on a parameter that is determined with the prior: whether the data add anything."""
+    rows, _ = prior
+    weights = np.linalg.lstsq(rows.T, gradient, rcond=None)[0]
+    is_given = np.linalg.norm(rows.T @ weights - gradient) <= MAX_MISFIT * np.linalg.norm(gradient)
+    return PRIOR_ONLY if is_given and std >= UNCHANGED * np.linalg.norm(weights) else BY_PRIOR
 
 
 def _residuals(motions: Sequence[Prediction]) -> dict[str, Residual]:

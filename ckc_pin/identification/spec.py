@@ -77,12 +77,17 @@ class EstimateSpec(FileStruct, frozen=True, kw_only=True):
     robust
         Whether instants with large residuals have less weight.
         ``robust = true``
+    prior : the parameter's
+        Standard deviations of start values, such as those of CAD, by parameter with wildcards. A text in percent is
+        relative to the start value.
+        ``prior = {"link.*.mass" = "5 %", "joint.hip.damping" = 0.01}``
     """
 
     parameters: Annotated[list[str], msgspec.Meta(min_length=1)]
     method: Literal["torques", "motion"] = "torques"
     physical: bool = True
     robust: bool = False
+    prior: dict[str, PositiveFloat | str] = {}
 
 
 class IdentifySpec(FileStruct, frozen=True, kw_only=True):

@@ -10,11 +10,13 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
-from ckc_pin.identification.fit import LinearFit, fit_linear
+from ckc_pin.identification.fit import LinearFit, fit_linear, no_prior
 from ckc_pin.identification.measured_motion import MeasuredMotion, SplineFit, estimate_motion, fit_spline
+from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
+from ckc_pin.identification.structure import Advice
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["identify_torques"]
@@ -52,22 +54,24 @@ class _Equations:
 
 
 def identify_torques(
-    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, physical: bool, robust: bool
-) -> Identification:
+    mechanism: Mechanism, records: Sequence[Record], parameters: Sequence[str], *, physical: bool, robust: bool,
+    prior: Mapping[str, float | str],
+) -> Identification:  # fmt: skip
     """Estimate parameters in which torques are linear (InputError)."""
     regressor = TorqueRegressor(mechanism, parameters)
+    known = make_prior(regressor, prior)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
         records = [_with_delay(mechanism, regressor, record, warnings) for record in records]
         equations = [_equations(mechanism, regressor, record, warnings) for record in records]
         fitted = [x for x in equations if not x.record.validation]
         columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
-        if right.size < columns.shape[2]:
+        if right.size + len(known[0]) < columns.shape[2]:
             raise InputError(
                 f"identify: {right.size} equations for {columns.shape[2]} unknowns; record a longer motion or estimate "
                 "less"
             )
-        fit = fit_linear(columns, right, robust=robust)
+        fit = fit_linear(columns, right, known, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
         fit = fit.with_errors(
             [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
@@ -75,10 +79,11 @@ def identify_torques(
         step = fit.x
         if physical:
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
+        advice = Advice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
     motions = [_prediction(x, mechanism.motors.names, step, fit) for x in equations]
     return make_result(
         "torques", regressor, fit, regressor.start + regressor.scale * step, motions, leak=LEAK_TOLERANCE,
-        complete=physical, instants=len(right), warnings=warnings,
+        complete=physical, instants=len(right), warnings=warnings, prior=known, advice=advice,
     )  # fmt: skip
 
 
@@ -136,7 +141,7 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
 
     def residual(delay: float) -> float:
         equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS)
-        off = fit_linear(equations.columns, equations.right).residual
+        off = fit_linear(equations.columns, equations.right, no_prior(len(regressor.names))).residual
         return float(np.log(np.mean(off**2, axis=0) + 1e-300).sum())
 
     grid = np.linspace(-MAX_DELAY, MAX_DELAY, DELAY_GRID)

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
-from ckc_pin.base.validation import suggest_name
-from ckc_pin.errors import InputError
-from ckc_pin.identification.physical import nearest_physical
+from ckc_pin.base.validation import match_names
+from ckc_pin.identification.physical import MIN_WEIGHT, nearest_physical
 from ckc_pin.identification.pseudo_inertia import MOMENTS
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap, inertial_rotation
-from ckc_pin.mechanism.parameters import INERTIA_ENTRIES, split_component
+from ckc_pin.mechanism.parameters import INERTIA_ENTRIES
 
 __all__ = ["INERTIAL", "LINK_VALUES", "ParameterValue", "Unknown", "Unknowns", "expand_names", "link_inertial_axes",
            "link_moments", "moment_unknowns", "total_mass", "typical_size"]  # fmt: skip
@@ -122,7 +120,9 @@ class Unknowns:
                 parameters.append(ParameterValue(name, float(values[k]), float(self.start[k]), units[k]))
         return parameters
 
-    def nearest_physical(self, measured: Array, determined: Array, information: Array) -> Array:
+    def nearest_physical(
+        self, measured: Array, determined: Array, information: Array, weight: float = MIN_WEIGHT
+    ) -> Array:
         """Return steps of all unknowns from their start, in typical sizes, to values that some mechanism can have.
 
         See `physical.nearest_physical`.
@@ -130,8 +130,9 @@ class Unknowns:
         in_bodies = {int(k) for at in self.bodies for k in at}
         positive = [k for k, x in enumerate(self.names) if k not in in_bodies and x.rpartition(".")[2] in POSITIVE]
         return nearest_physical(
-            measured, determined, information, self.start, self.scale, self.bodies, np.array(positive, dtype=np.intp)
-        )
+            measured, determined, information, self.start, self.scale, self.bodies, np.array(positive, dtype=np.intp),
+            weight,
+        )  # fmt: skip
 
 
 def total_mass(mechanism: Mechanism) -> float:
@@ -188,35 +189,17 @@ def link_moments(parameters: ParameterMap, link: str) -> Array:
     return np.asarray(inertia.toDynamicParameters())
 
 
-def expand_names(names: Iterable[str], patterns: Sequence[str], use: str) -> list[str]:
+def expand_names(names: Iterable[str], patterns: Sequence[str]) -> list[str]:
     """Return the names that patterns with wildcards stand for, in the order of the names, each once.
 
-    A vector's name stands for its components. If the ten numbers of a link are unknown, its single ones are left out.
+    If the ten numbers of a link are unknown, its single ones are left out.
 
     Raises
     ------
     InputError
-        A pattern that no name matches. The message says which names there are, after `use`.
+        A pattern that no name matches.
     """
     names = list(names)
-    matches = {pattern: {x for x in names if _matches(x, pattern)} for pattern in patterns}
-    for pattern in patterns:
-        if not matches[pattern]:
-            kinds = sorted({_kind(name) for name in names})
-            raise InputError(
-                f"identify: parameters: nothing is called {pattern!r}{suggest_name(pattern, names)}; {use} "
-                f"{', '.join(kinds)}"
-            )
-    chosen = [name for name in names if any(name in x for x in matches.values())]
-    whole = tuple(name.removesuffix(INERTIAL) for name in chosen if name.endswith(f".{INERTIAL}"))
-    return [name for name in chosen if name.endswith(f".{INERTIAL}") or not name.startswith(whole)]
-
-
-def _matches(name: str, pattern: str) -> bool:
-    return fnmatchcase(name, pattern) or fnmatchcase(split_component(name)[0], pattern)
-
-
-def _kind(name: str) -> str:
-    root, _, rest = name.partition(".")
-    key = rest.partition(".")[2]
-    return f"{root}.*.{key}" if key else name
+    matches = {name for pattern in patterns for name in match_names(pattern, names, "identify: parameters")}
+    whole = tuple(name.removesuffix(INERTIAL) for name in matches if name.endswith(f".{INERTIAL}"))
+    return [name for name in names if name in matches and (name.endswith(f".{INERTIAL}") or not name.startswith(whole))]

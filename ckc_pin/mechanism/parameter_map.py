@@ -154,8 +154,18 @@ class ParameterMap:
 
     def derivative(self, name: str) -> dict[str, Array]:
         """Return the derivatives of all numbers that depend on a single parameter, shapes as of the numbers."""
-        _, slopes = self.linearize([name], np.array([self.value_of(name)]))
-        return {key: slope[0] for key, slope in slopes.items() if slope.any()}
+        return self.derivatives([name])[name]
+
+    def derivatives(self, names: Sequence[str]) -> dict[str, dict[str, Array]]:
+        """Return `derivative` of many single parameters, by name."""
+        masses = [name for name in names if name.endswith(".mass")]  # scale inertias, which other names would fix
+        slopes: dict[str, dict[str, Array]] = {}
+        for group in (masses, [name for name in names if name not in masses]):
+            values = np.array([self.value_of(name) for name in group])
+            _, together = self.linearize(group, values) if group else ({}, {})
+            for k, name in enumerate(group):
+                slopes[name] = {key: slope[k] for key, slope in together.items() if slope[k].any()}
+        return slopes
 
     def linearize(self, names: Sequence[str], values: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Return the numbers that depend on single parameters, and their derivatives (names, ...), at other values."""

@@ -62,7 +62,7 @@ def _placements(mechanism: Mechanism, slopes: Mapping[str, Array]) -> Iterator[P
     model, closure, springs = mechanism.tree.model, mechanism.closure, mechanism.springs
     zeros = np.zeros((model.njoints, 3, 3))
     turned, moved = slopes.get("rotation", zeros), slopes.get("offset", zeros[:, 0])
-    for joint in range(1, model.njoints):
+    for joint in np.flatnonzero(turned.any(axis=(1, 2)) | moved.any(axis=1)).tolist():
         placement = model.jointPlacements[joint]
         turn = _angular(turned[joint], placement.rotation)
         slide = moved[joint] - np.cross(turn, placement.translation)  # of the carrier's origin

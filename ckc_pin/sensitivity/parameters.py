@@ -61,8 +61,10 @@ STEPS_AT_STOP = (1e-4, 1e-5, 1e-6)  # the same, if the start is at the stop
 SCENE_ROOTS = ("controller", "initial")
 
 
-def sensitivity_setup(names: Sequence[str]) -> SetUpSensitivities:
-    """Return the function with which `prepare` sets up the sensitivities to some parameters."""
+def sensitivity_setup(
+    names: Sequence[str], directions: Mapping[str, Mapping[str, float]] | None = None
+) -> SetUpSensitivities:
+    """Return the function with which `prepare` sets up the sensitivities to some parameters, and along directions."""
 
     def setup(
         scene: Scene,
@@ -74,14 +76,23 @@ def sensitivity_setup(names: Sequence[str]) -> SetUpSensitivities:
         overrides, rebuild = scene.spec.parameters, partial(rebuild_scene_mechanism, scene)
         law = unwrap_sampled(controller)
         parameters = find_sensitivity_parameters(mechanism, scene, law, actuation, names, rebuild, start.at.q_tree)
+        if directions:
+            members = list(dict.fromkeys(name for direction in directions.values() for name in direction))
+            of = {
+                x.name: x
+                for x in find_sensitivity_parameters(
+                    mechanism, scene, law, actuation, members, rebuild, start.at.q_tree
+                )
+            }
+            parameters += [_combine_inertial(name, direction, of) for name, direction in directions.items()]
         require_supported_scene(mechanism, scene, controller, parameters)
         require_movable(mechanism, overrides, parameters, rebuild)
         if scene.spec.initial.at == "assembled":
             parameters = [at_assembled_stop(mechanism, overrides, x, rebuild) for x in parameters]
-        arguments, directions = argument_directions(mechanism, parameters) or (None, None)
+        arguments, slopes = argument_directions(mechanism, parameters) or (None, None)
         library = select_derivative_library(mechanism, scene.spec.solver.terms, arguments)
         table = sensitivity_table(
-            mechanism, parameters, directions, at_equilibrium=scene.spec.initial.at == "equilibrium",
+            mechanism, parameters, slopes, at_equilibrium=scene.spec.initial.at == "equilibrium",
             target=find_compensated_target(mechanism, law), controlled=controller is not None,
         )  # fmt: skip
         return SensitivitySetup(tuple(parameters), table, library, arguments if library is None else None)
@@ -287,11 +298,11 @@ def find_sensitivity_parameters(
     labels = [part for name in names for part in parts_of(name, values)]
     if len(set(labels)) < len(labels):
         raise InputError(f"sensitivities: a parameter is repeated in {', '.join(names)}; name each of them once")
-    parameters = ParameterMap(mechanism, scene.spec.parameters, rebuild)
+    slopes = ParameterMap(mechanism, scene.spec.parameters, rebuild).derivatives(
+        [name for name in labels if is_parameter(name)]
+    )
     return [
-        _mechanism_parameter(mechanism, actuation, name, parameters.derivative(name))
-        if is_parameter(name)
-        else of_scene[name]
+        _mechanism_parameter(mechanism, actuation, name, slopes[name]) if is_parameter(name) else of_scene[name]
         for name in labels
     ]
 
@@ -309,6 +320,24 @@ def _mechanism_parameter(
         placements=tuple(derivative for place, derivative in by_place if place in ("joint", "reported")),
         slopes=slopes,
     )
+
+
+def _combine_inertial(
+    name: str, direction: Mapping[str, float], parameters: Mapping[str, SensitivityParameter]
+) -> SensitivityParameter:
+    """Return the directional derivative along inertial parameters with these coefficients (InputError)."""
+    inertias: dict[int, Array] = {}
+    slopes: dict[str, Array] = {}
+    for member, coefficient in direction.items():
+        for derivative in parameters[member].derivatives:
+            if derivative.kind != "inertia":
+                raise InputError(f"sensitivities: directions: {member} is no mass, centre of mass or inertia of a link")
+            step = coefficient * derivative.values
+            inertias[derivative.index] = inertias.get(derivative.index, np.zeros(len(step))) + step
+        for key, slope in parameters[member].slopes.items():
+            slopes[key] = slopes.get(key, np.zeros_like(slope)) + coefficient * slope
+    derivatives = tuple(ParameterDerivative("inertia", joint, values) for joint, values in inertias.items())
+    return SensitivityParameter(name, derivatives, slopes=slopes)
 
 
 def _controller_parameters(mechanism: Mechanism, scene: Scene, controller: object) -> Iterator[SensitivityParameter]:

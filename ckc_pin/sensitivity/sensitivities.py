@@ -268,6 +268,7 @@ def sensitivities(
     controller: Controller | Sampled | ControlLaw | Mapping[str, Any] | None = None,
     events: Sequence[Event | Mapping[str, Any]] = (),
     instants: Array | None = None,
+    directions: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Sensitivities:
     """Run a scene and compute the derivatives of its motion with respect to parameters.
 
@@ -297,6 +298,9 @@ def sensitivities(
         As in `simulate`.
     instants : (m,) array, optional
         Output instants, instead of the scene's, s: increasing, from 0 to at most t_end.
+    directions : mapping of str to mapping of str to float, optional
+        Directional derivatives by name, after those of the parameters: coefficients of masses, centres of mass and
+        inertias of links, as ``{"all masses": {"link.rod.mass": 1.0, "link.crank.mass": 0.5}}``.
 
     Returns
     -------
@@ -318,9 +322,10 @@ def sensitivities(
     require_type(parameters, Sequence, "sensitivities: parameters", EXPECTED_NAMES)
     for name in parameters:
         require_type(name, str, "sensitivities: parameters", EXPECTED_NAMES)
-    if not parameters:
+    if not parameters and not directions:
         raise InputError("sensitivities: name at least one parameter")
-    ready = prepare(scene, controller, events, set_up_sensitivities=sensitivity_setup(tuple(parameters)))
+    setup = sensitivity_setup(tuple(parameters), directions)
+    ready = prepare(scene, controller, events, set_up_sensitivities=setup)
     if instants is not None:
         ready = replace(ready, instants=_require_instants(instants, scene.spec.t_end))
     started = perf_counter()

@@ -336,6 +336,22 @@ def robots(folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, 
     published_robots.main(folder)
 
 
+@app.command(epilog=examples("identification", "identification delta leg --trials 40 --method motion"))
+def identification(
+    cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
+    trials: Annotated[int, typer.Option(min=1, help="of each case")] = 200,
+    method: Annotated[str, typer.Option(help="torques or motion")] = "torques",
+) -> None:
+    """Count how often the truth is within two standard deviations of identified parameters.
+
+    Prints the share by case. Exits with 1 if one is below its bounds.
+    """
+    from scripts.experiments import identification_trials
+
+    names = check_names(cases, identification_trials.CASES, "case") or identification_trials.CASES
+    raise typer.Exit(identification_trials.main(names, method, trials))
+
+
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """Make the pictures of docs/images with a browser."""

@@ -165,6 +165,17 @@ def test_several_parameters_of_one_body_act_together(all_kinds: Mechanism) -> No
             assert (values[key][k] if key in values else there) == pytest.approx(there, abs=1e-12), key
 
 
+def test_derivatives_of_all_parameters_equal_those_of_each_alone(all_kinds: Mechanism) -> None:
+    """A mass scales its link's inertia, also if entries of the inertia are parameters too."""
+    parameters, names = ParameterMap(all_kinds), single_names(all_kinds)
+    together = parameters.derivatives(names)
+    for name in names:
+        alone = parameters.derivative(name)
+        assert together[name].keys() == alone.keys(), name
+        for key, slope in alone.items():
+            assert together[name][key] == pytest.approx(slope, rel=1e-12, abs=1e-14), (name, key)
+
+
 def test_given_inertia_is_not_scaled_by_a_mass(all_kinds: Mechanism) -> None:
     overrides = {"link.one.mass": 2.0, "link.one.inertia.iyy": 4.0}
     linkage = linkage_with(all_kinds, overrides)

@@ -80,7 +80,11 @@ CASES = [
     ),
     Bad("no parameters", ["excite", "five_bar", "--parameters", ","], ["excite: parameters: nothing to identify"]),
     Bad("no rate", ["excite", "five_bar", "--rate", "0"], ["--rate 0: expected a number above zero"]),
-    Bad("unknown limit", ["excite", "five_bar", "--limit", "v.x=1"], ["excite: limits: v.x: no such quantity"]),
+    Bad(
+        "unknown limit",
+        ["excite", "five_bar", "--limit", "v.x=1"],
+        ["excite: limits: nothing is called 'v.x'; there are"],
+    ),
     Bad("limit without value", ["excite", "five_bar", "--limit", "v.theta_1"], ["--limit v.theta_1: write KEY=VALUE"]),
     # the state of terms
     Bad("state that is not JSON", [*TERMS, "theta_1=1"], ["--q theta_1=1: not JSON", "--q '{\"theta_1\": 0.4}'"]),

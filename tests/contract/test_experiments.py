@@ -26,6 +26,7 @@ PARTS = {
     "right_hand_sides": (["1"], "| 1 | 3 | 1 |"),
     "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
+    "identification": (["leg", "--trials", "3"], "| leg | 3 | 10 |"),
     "peer": ([f"{sys.executable} {SCIPY_PEER}", "tracking_1e-04"], "tracking_1e-04: not compared, the law of"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }

@@ -23,10 +23,16 @@ DEGREES = {name: np.degrees(x) for name, x in ENCODERS.items()}
 CASES: dict[str, tuple[Callable[[], Any], str]] = {
     "nothing": (lambda: calibrate("five_bar", ENCODERS, []), "nothing to calibrate"),
     "type": (lambda: calibrate("five_bar", ENCODERS, [3]), "expected names of parameters"),  # type: ignore[list-item]
-    "unknown parameter": (lambda: calibrate("five_bar", ENCODERS, ["joint.theta_9.xyz.x"]), "no 'joint.theta_9.xyz.x'"),
-    "unknown pattern": (lambda: calibrate("five_bar", ENCODERS, ["joint.*.length"]), "matches no geometric parameter"),
+    "unknown parameter": (
+        lambda: calibrate("five_bar", ENCODERS, ["joint.theta_9.xyz.x"]),
+        "nothing is called 'joint.theta_9",
+    ),
+    "unknown pattern": (
+        lambda: calibrate("five_bar", ENCODERS, ["joint.*.length"]),
+        r"there are joint.\*.xyz, joint.\*.rpy",
+    ),
     "mass": (lambda: calibrate("five_bar", ENCODERS, ["link.link_1.mass"]), "no influence on positions"),
-    "encoder": (lambda: calibrate("five_bar", TIP, ["encoder.theta_2.offset"]), "there are encoder.theta_1.offset"),
+    "encoder": (lambda: calibrate("five_bar", TIP, ["encoder.theta_2.offset"]), "did you mean 'encoder.theta_1"),
     "reading": (lambda: calibrate("five_bar", {"theta_7": [0.0]}, NAMES), "no reading 'theta_7'; there are theta_1"),
     "no poses": (lambda: calibrate("five_bar", {"theta_1": []}, NAMES), "there are no readings"),
     "ragged": (lambda: calibrate("five_bar", {**ENCODERS, "theta_2": [0.1, 0.2]}, NAMES), "theta_2: expected finite"),
@@ -51,8 +57,11 @@ CASES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "redundant rows": (lambda: calibrate("bricard", bricard_poses(), ["joint.*.rpy"]), "redundant"),
     "noise": (lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"theta_1": 0.0}), "expected a positive number"),
-    "noise of nothing": (lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"tip.x": 1.0}), "noise: no 'tip.x'"),
-    "prior": (lambda: calibrate("five_bar", ENCODERS, NAMES, prior={"gravity": 1.0}), "prior: no 'gravity'"),
+    "noise of nothing": (
+        lambda: calibrate("five_bar", ENCODERS, NAMES, noise={"tip.x": 1.0}),
+        "nothing is called 'tip.x'",
+    ),
+    "prior": (lambda: calibrate("five_bar", ENCODERS, NAMES, prior={"gravity": 1.0}), "nothing is called 'gravity'"),
     "loss": (lambda: calibrate("five_bar", ENCODERS, NAMES, loss="l1"), "loss: expected 'squares' or 'huber'"),
     "tracker": (lambda: calibrate("five_bar", ENCODERS, NAMES, tracker="unknown"), "needs readings of a point"),
     "tracker without z": (lambda: calibrate("five_bar", TIP, NAMES, tracker="unknown"), "x, y and z of a point"),

@@ -194,7 +194,7 @@ def test_command_writes_scene_table_and_figure(tmp_path: Path) -> None:
         ({"parameters": []}, "excite: parameters: nothing to identify"),
         ({"parameters": ["link.link_9.inertial"]}, "excite: parameters: nothing is called 'link.link_9.inertial'"),
         ({"parameters": ["gravity"]}, "excite: parameters: nothing is called 'gravity'"),
-        ({"limits": {"v.theta_9": 1.0}}, r"excite: limits: v.theta_9: no such quantity; did you mean"),
+        ({"limits": {"v.theta_9": 1.0}}, r"excite: limits: nothing is called 'v.theta_9'; there are theta_1"),
         ({"limits": {"theta_1": 1.0}}, r"excite: limits: theta_1: expected \[lower, upper\], got 1.0"),
         ({"limits": {"v.theta_1": -1.0}}, r"limits: v.theta_1: expected \[lower, upper\] or a number above zero"),
         ({"limits": {"theta_1": [1.0, -1.0]}}, "limits: theta_1: no value is between 1 and -1"),

@@ -131,11 +131,11 @@ def test_points_rates_gaps_delays_and_unequal_times():
     late = measure(run_five_bar(driven=True), driven=True)
     late["tau.theta_1"] = np.interp(late["t"] - 0.02, KNOTS, TORQUES[:, 0])  # recorded 0.02 s later than it happened
     record = read_record(late, start, DataSpec(file="late", delay={"tau.theta_1": 0.02}, span=(0.02, 0.98)))
-    result = identify_motion(start, [record], ["joint.theta_2.xyz.x", "joint.theta_1.friction"], robust=False)
+    result = identify_motion(start, [record], ["joint.theta_2.xyz.x", "joint.theta_1.friction"], robust=False, prior={})
     require_truth(result, {"joint.theta_2.xyz.x": 0.2794, "joint.theta_1.friction": 0.02}, 1e-6)
     record = read_record(late, start, DataSpec(file="late", delay={"tau.theta_1": "estimate"}))
     with pytest.raises(InputError, match=r'delay: tau\.theta_1: method = "torques" estimates delays'):
-        identify_motion(start, [record], ["joint.theta_1.friction"], robust=False)
+        identify_motion(start, [record], ["joint.theta_1.friction"], robust=False, prior={})
 
 
 def test_two_records_and_one_that_is_not_fitted():
@@ -201,7 +201,7 @@ def test_slider_crank_gives_masses_friction_and_a_length():
 BAD = [
     ({"method": "motions"}, 'method: expected "torques" or "motion", got \'motions\''),
     ({"method": "motion", "physical": False}, "simulates runs, which need inertias that some body can have"),
-    ({"parameters": ["motor.*.offset"]}, "runs have derivatives with respect to gravity.x, gravity.y"),
+    ({"parameters": ["motor.*.offset"]}, "there are link.*.inertial, gravity.x, gravity.y"),
     ({"parameters": ["joint.theta_1.fricton"]}, "did you mean 'joint.theta_1.friction'"),
     ({"drop": "theta_3"}, "no column theta_1, theta_3; 2 coordinates and the torques of all motors or of none"),
     ({"drop": "tau.theta_3"}, "no column tau.theta_3; 2 coordinates and the torques of all motors or of none"),

@@ -252,7 +252,7 @@ def test_delay_of_torques_is_estimated():
     delay = {"tau.theta_1": "estimate"}
     mechanism = load("five_bar")
     result = identify_torques(
-        mechanism, [Record("late", data["t"], values, {}, delay)], PARAMETERS, physical=False, robust=False
+        mechanism, [Record("late", data["t"], values, {}, delay)], PARAMETERS, physical=False, robust=False, prior={}
     )
     assert float(result.warnings[0].split("the torques are ")[1].split(" ms")[0]) == pytest.approx(7.3, abs=0.3)
 
@@ -331,7 +331,8 @@ def test_command_writes_result_parameters_and_figures(tmp_path):
     assert json.loads((tmp_path / "o" / "identification.json").read_text()) == done.json
     assert set(done.json["validation"]) == {"tau.theta_1", "tau.theta_3"}
     assert done.json["parameters"]["link.link_1.mass"] == {
-        "value": None, "std": None, "start": 0.2451, "verdict": "not identifiable"}  # fmt: skip
+        "value": None, "std": None, "start": 0.2451, "verdict": "not identifiable",
+        "missing": "no motion of this mechanism determines it"}  # fmt: skip
     assert done.json["parameters"]["joint.theta_1.friction"]["value"] == pytest.approx(0.05, abs=0.02)
     for figure in ("torques", "residuals", "correlation"):
         assert (tmp_path / "o" / f"{figure}.png").stat().st_size > 5000

@@ -287,3 +287,14 @@ def test_load_and_sensitivities_accept_the_same_names(tmp_path: Path) -> None:
             ckc_pin.load(tmp_path / "bars.toml", {name: 1.0})
         messages.append(str(error.value).partition(": no ")[2])
         assert messages[0] == messages[1]
+
+
+def test_directions_are_sums_of_derivatives_with_respect_to_inertial_parameters() -> None:
+    direction = {"link.link_2.mass": 0.7, "link.link_2.com.x": -0.2, "link.link_4.inertia.izz": 3.0}
+    scene = ckc_pin.load_scene("five_bar/swing", {"t_end": 0.3})
+    result = sensitivities(scene, [*direction, "joint.theta_2.xyz.x"], directions={"all": direction})
+    assert result.parameters == (*direction, "joint.theta_2.xyz.x", "all")
+    expected = result.q_tree[:, :, :3] @ np.array(list(direction.values()))
+    assert result.q_tree[:, :, 4] == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
+    with pytest.raises(InputError, match=r"directions: joint.theta_2.xyz.x is no mass, centre of mass or inertia"):
+        sensitivities(scene, ["link.link_2.mass"], directions={"all": {"joint.theta_2.xyz.x": 1.0}})
