@@ -18,6 +18,7 @@ MAX_MACHINE_M = 1000.0  # larger mechanisms are in millimetres whatever their ma
 LARGE_MACHINE_M = 10.0  # a mechanism of this size has more mass than MIN_MASS_PER_METRE
 MIN_MASS_PER_METRE = 1.0  # kg/m: a light truss has more
 MAX_LENGTH_RATIO = 50.0  # of a length to the median of the others
+MIN_GAP = 3.0  # ratio of the shortest long length to the longest other one: a row of many links has none
 MIN_LENGTH_M = 5.0  # shorter lengths are not reported
 MIN_LIMIT_M = 20.0  # limits of slides below it may stand for none
 MAX_LENGTH_M = 1e5  # larger limits stand for none
@@ -70,7 +71,9 @@ def _find_long(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[st
     lengths = {name: math.hypot(*x) for name, x in values.items() if isinstance(x, tuple) and _is_position(name)}
     lengths |= {name: x for name, x in values.items() if isinstance(x, float) and name.endswith("length")}
     usual = median([x for x in lengths.values() if x > 0] or [mechanism.size])
-    yield from (f"{name} = {x:.4g} m" for name, x in lengths.items() if _is_long(x, usual))
+    shortest_long = min((x for x in lengths.values() if _is_long(x, usual)), default=math.inf)
+    if shortest_long > MIN_GAP * max((x for x in lengths.values() if not _is_long(x, usual)), default=0.0):
+        yield from (f"{name} = {x:.4g} m" for name, x in lengths.items() if _is_long(x, usual))
     tree = mechanism.tree
     lower, upper = tree.limits()
     for k in np.flatnonzero(tree.in_metres):

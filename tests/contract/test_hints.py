@@ -11,7 +11,7 @@ from ckc_pin import InputError, MechanismError, check, load, load_scene, simulat
 from ckc_pin.base.validation import find_nearest_name, suggest_name
 from ckc_pin.kinematics.loop_types import describe_locking_loops
 from ckc_pin.mechanism import Mechanism
-from ckc_pin.mechanism.library import shipped
+from ckc_pin.mechanism.library import GeneratorSpec, shipped
 from ckc_pin.mechanism.unit_hints import find_unit_warnings
 from tests.contract.helpers.command import ckc
 from tests.contract.sketches import FOUR_BAR, FOUR_BAR_LOOP
@@ -263,3 +263,9 @@ def test_gain_of_a_wrong_length_says_which_shapes_are_accepted() -> None:
         "controller.K_P: expected a number, a table by joint, a list of 2 numbers (the diagonal) or a 2 x 2 matrix in "
         "the order theta_1, theta_3, got a list of 3 numbers"
     )
+
+
+def test_row_of_many_links_has_no_lengths_in_millimetres() -> None:
+    """The feet of 60 squares are up to 60 m from the first one, without a gap in between."""
+    mechanism = load(GeneratorSpec(generator="n_four_bar", N=60))
+    assert find_unit_warnings(mechanism) == []
