@@ -27,10 +27,8 @@ from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.names import list_catalogue
 from ckc_pin.scene.parts import build_scene_controller
 
-ROOT = Path(__file__).resolve().parents[2]
 INERT = [{"coordinate": "theta_1", "value": 50.0}]
 FORMULATIONS = ("dae", "reduced", "spf")
-MAX_LINES = 7000
 CIRCLE = {
     "controller.desired": {"point": "tip", "circle": {"centre": [0.15, -0.42, 0.0], "radius": 0.06, "frequency": 1.0}},
     "initial": {"q": {"theta_1": -1.2, "theta_3": -1.9}},
@@ -138,9 +136,17 @@ def run_overhead_us() -> float:
     return 1e6 * (min_processor_time(lambda: run_prepared(prepared), 300) - min_processor_time(native, 300))
 
 
-def process_seconds(*words: str) -> float:
-    """Return user and system time of a process, s, the minimum of nine runs after a first one."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+def process_seconds(*words: str, **variables: str) -> float:
+    """Return user and system time of a process, s, the minimum of nine runs after a first one.
+
+    Parameters
+    ----------
+    *words : str
+        The command.
+    **variables : str
+        Environment variables.
+    """
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"} | variables
 
     def once() -> float:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -152,22 +158,17 @@ def process_seconds(*words: str) -> float:
     return min(once() for _ in range(9))
 
 
-def measure_command_ratio() -> float:
-    """Return the time of `ckc run` over that of importing Pinocchio."""
-    ckc = str(Path(sys.executable).parent / "ckc")
-    run = process_seconds(ckc, "run", "five_bar/swing", "--json")
-    return run / process_seconds(sys.executable, "-c", "import pinocchio")
+def measure_command_ratio(*words: str) -> float:
+    """Return the time of a `ckc` command, without compiled terms, over that of importing Pinocchio."""
+    with TemporaryDirectory() as empty_cache:
+        command = process_seconds(str(Path(sys.executable).parent / "ckc"), *words, XDG_CACHE_HOME=empty_cache)
+    return command / process_seconds(sys.executable, "-c", "import pinocchio")
 
 
-def count_lines() -> float:
-    """Count the lines of the run loop's source in Python and C++."""
-    files = [
-        path
-        for folder in ("ckc_pin/run", "ckc_pin/native")
-        for path in (ROOT / folder).rglob("*")
-        if path.suffix in (".py", ".cpp", ".hpp")
-    ]
-    return float(sum(len(path.read_text().splitlines()) for path in files))
+def measure_import_ratio() -> float:
+    """Return the time of importing ckc_pin over that of importing Pinocchio."""
+    ours, theirs = (process_seconds(sys.executable, "-c", f"import {name}") for name in ("ckc_pin", "pinocchio"))
+    return ours / theirs
 
 
 def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
@@ -193,8 +194,10 @@ def rows() -> Iterator[tuple[str, Callable[[], float], float, str]]:
         3,
         "ms",
     )
-    yield "ckc run five_bar/swing --json / import pinocchio", measure_command_ratio, 1.8, ""
-    yield "lines of ckc_pin/run and native", count_lines, MAX_LINES, ""
+    yield "import ckc_pin / import pinocchio", measure_import_ratio, 1.25, ""
+    for scene in ("five_bar/swing", "slider_crank"):
+        words = ("run", scene, "--set", "t_end=1.0", "--set", "solver.rtol=1e-6", "--json")
+        yield f"ckc {' '.join(words)} / import pinocchio", partial(measure_command_ratio, *words), 1.5, ""
 
 
 def main(only: str = "") -> int:
