@@ -119,7 +119,7 @@ def breakpoints_table(
         Motions that begin in the run, whose times are counted from there. The loop adds them.
     """
     times, *others = (
-        _distinct(np.unique(np.concatenate([np.zeros(0), *lists])))
+        _distinct(np.sort(np.concatenate([np.zeros(0), *lists])))
         for lists in [[np.array(switches, float), *map(_corners, functions)], *([_corners(f)] for f in later)]
     )
     if not len(times) and not others:
