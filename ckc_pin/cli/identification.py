@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -20,6 +21,11 @@ from ckc_pin.cli.output import (
 )
 from ckc_pin.cli.signals import interrupts
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ckc_pin.identification.result import Identification
+
 __all__ = ["identify"]
 
 
@@ -33,7 +39,7 @@ __all__ = ["identify"]
 @click.argument(
     "file", metavar="FILE", type=options.PATH, help="A *.identify.toml: a mechanism, recorded motions, and parameters."
 )
-@options.out(help="Folder for identification.json and parameters.toml.")
+@options.out(help="Folder for identification.json, parameters.toml and report.html.")
 @options.figures
 @options.as_json
 def identify(file: Path, out: Path | None, figures: bool, as_json: bool) -> None:
@@ -51,13 +57,23 @@ def identify(file: Path, out: Path | None, figures: bool, as_json: bool) -> None
                 stack.enter_context(lock_folder(out))
                 write_atomic(out / "identification.json", to_json(result.to_dict()) + "\n")
                 result.save(out / "parameters.toml")
-            if figures:
-                from ckc_pin.view.identification_figures import save_identification
-
-                with skip_figures_without_matplotlib():
-                    save_identification(result, out)
+            _write_report(result, out, figures)
     if as_json:
         print_json(result.to_dict())
     else:
         print_summary(result.summary())
-        print(format_destination(out, "identification.json and parameters.toml"))
+        print(format_destination(out, "identification.json, parameters.toml and report.html"))
+
+
+def _write_report(result: Identification, out: Path, figures: bool) -> None:
+    """Write report.html, and the figures as files."""
+    from ckc_pin.view.identification_figures import draw_identification
+    from ckc_pin.view.layout import write_figure
+    from ckc_pin.view.report_page import render_report
+
+    drawn: dict[str, Figure] = {}
+    with skip_figures_without_matplotlib():
+        drawn = draw_identification(result)
+    write_atomic(out / "report.html", render_report(result, drawn))
+    for name, figure in drawn.items() if figures else ():
+        write_figure(figure, out, name, ("png",))

@@ -51,7 +51,7 @@ COST_TOLERANCE = 1e-5  # relative: a smaller decrease of the cost ends the fit
 FIRST_COST_TOLERANCE = 1e-2  # the same for the first parts of records, and for the first weights
 # Of the distance of inertias from their start values, one after the other: steps that are far from the minimum would
 # otherwise take directions that are hardly determined to absurd inertias.
-PRIOR_WEIGHTS = (1e-1, 1e-2, 1e-3, MIN_WEIGHT)
+PRIOR_WEIGHTS = (1e-1, MIN_WEIGHT)
 PROMISING = 1e-3  # part of the cost by which the linear model says that it can still decrease
 MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 HORIZONS = (0.1, 0.3)  # parts of the records that are fitted first, where runs from the start values leave the data

@@ -23,14 +23,17 @@ __all__ = ["MIN_WEIGHT", "nearest_physical"]
 
 MAX_INFORMATION = 1e3  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
 MAX_INFORMATION = 1e6  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
-MIN_WEIGHT = 1e-4  # of the divergence: moves what is measured by some 1e-4 of its standard deviation
-WEIGHTS = 10.0 ** np.arange(-1.0, -4.1, -0.5)  # one after the other; larger ratios take many more Newton steps in all
+MIN_WEIGHT = 1e-2  # of the divergence: moves what is measured by less than 1e-2 of its standard deviation
+WEIGHTS = 10.0 ** np.arange(0.0, -2.1, -0.5)  # one after the other; larger ratios take many more Newton steps in all
 MAX_STEPS = 300  # of Newton's method, for each weight; each of them is feasible and better than the one before
 CENTRED, CONVERGED = 0.25, 1e-12  # largest decrement at the end of a weight, and of the last one, in weights
 ROUNDING = 1e-14  # relative to the value: a smaller decrease cannot be seen
-MIN_DECREASE, MIN_LENGTH = 0.1, 1e-6  # of a step, relative to the decrease of the quadratic model and to its length
-MIN_EIGENVALUE = 1e-6  # of a prior, relative to its largest in typical sizes: links without mass
-MASSLESS_WEIGHT = 1e-3  # of the divergence of such links, relative: their masses can grow to what is measured
+MIN_DECREASE = 0.1  # of a step, relative to that of the quadratic model
+LENGTHS = 0.5 ** np.arange(21)  # of steps, relative
+SMALL = 1e-6  # eigenvalue in typical sizes, of links without mass or thickness
+FLAT = 1e-3  # smallest eigenvalue of a prior of links with mass but without thickness
+MASSLESS_WEIGHT = 1e-5  # of the divergence of links without mass, relative: they can grow to what is measured
+ZERO, ZERO_WEIGHT = 1e-3, 1e-2  # typical sizes of positive numbers that start at zero, and their weight, relative
 MIN_COLUMN = 1e-6  # makes steps of unknowns zero that neither the measurements nor a divergence determine
 
 
@@ -70,12 +73,12 @@ def nearest_physical(
             step, decrement = -solve_triangular(R, slope), float(slope @ slope)
             if decrement <= max(tolerance * w, ROUNDING * abs(value)):
                 break
-            length = 1.0
-            while length > MIN_LENGTH:
+            for length in LENGTHS:
                 if problem.value(x + length * step, w) <= value - MIN_DECREASE * length * decrement:
+                    x = x + length * step
                     break
-                length /= 2
-            x = x + length * step
+            else:
+                break  # the decrease is below rounding
     return x
 
 
@@ -98,7 +101,8 @@ class _Problem:
 
     def __init__(self, measured: Array, rows: Array, start: Array, positive: IntArray) -> None:
         self.measured, self.rows, self.positive = measured, rows, positive
-        self.first, self.sizes = start[positive], np.maximum(start[positive], 1e-3)
+        self.first, self.sizes = start[positive], np.maximum(start[positive], ZERO)
+        self.number_shares = np.where(self.first < ZERO, ZERO_WEIGHT, 1.0)
         self.prior = np.zeros(len(start))
         self.prior[positive] = self.sizes - self.first
 
@@ -111,11 +115,11 @@ class _Problem:
         self.basis = basis() * scale[self.at][..., None, None] / (unit[:, None, :, None] * unit[:, None, None, :])
         self.offset = np.einsum("li,lijk->ljk", (start / scale)[self.at], self.basis)
         values, axes = np.linalg.eigh(self.offset)
-        smallest = MIN_EIGENVALUE * np.maximum(values[:, -1], 1.0)
-        is_small, values = values[:, 0] < smallest, np.maximum(values, smallest[:, None])
+        has_mass = values[:, -1:] > SMALL
+        values = np.where(values < SMALL, np.where(has_mass, FLAT * values[:, -1:], SMALL), values)
         priors = (axes * values[:, None, :]) @ axes.swapaxes(1, 2)
         self.inverse = np.linalg.inv(priors)
-        self.shares = np.where(is_small, MASSLESS_WEIGHT, 1.0)  # of the weight, by link
+        self.shares = np.where(has_mass[:, 0], 1.0, MASSLESS_WEIGHT)  # of the weight, by link
         for at, one, prior, offset in zip(self.at, self.basis, priors, self.offset, strict=True):
             self.prior[at] = np.linalg.lstsq(one.reshape(10, 16).T, (prior - offset).ravel(), rcond=None)[0]
 
@@ -132,7 +136,8 @@ class _Problem:
         except np.linalg.LinAlgError:
             return np.inf
         divergence = self.shares @ (np.sum(self.inverse * P, axis=(1, 2)) - 2 * np.sum(np.log(diagonal), axis=1))
-        return float(0.5 * off @ off + weight * (divergence + np.sum(numbers / self.sizes - np.log(numbers))))
+        of_numbers = self.number_shares @ (numbers / self.sizes - np.log(numbers))
+        return float(0.5 * off @ off + weight * (divergence + of_numbers))
 
     def newton_equations(self, x: Array, weight: float) -> tuple[Array, Array]:
         """Return M and r: the gradient of the objective is M^T r, and its Hessian M^T M.
@@ -140,7 +145,7 @@ class _Problem:
         With P = L L^T, the Hessian of the divergence is J^T J for J = L^-1 dP L^-T, and its gradient is
         J^T (L^T P_0^-1 L - 1). A solution in these factors keeps twice the digits.
         """
-        p, bodies, root, roots = len(x), len(self.at), weight**0.5, (weight * self.shares)[:, None] ** 0.5
+        p, bodies, roots = len(x), len(self.at), (weight * self.shares)[:, None] ** 0.5
         L = np.linalg.cholesky(self._pseudo_inertias(x))
         left = np.linalg.solve(L[:, None], self.basis)
         factors = np.linalg.solve(L[:, None], left.swapaxes(2, 3)).reshape(bodies, 10, 16).swapaxes(1, 2)
@@ -148,7 +153,8 @@ class _Problem:
         np.put_along_axis(of_bodies, np.repeat(self.at[:, None], 16, axis=1), factors, axis=2)
         numbers = self.first + x[self.positive]
         of_positive = np.eye(p)[self.positive] / numbers[:, None]
-        rows = (self.rows, (roots[:, :, None] * of_bodies).reshape(-1, p), root * of_positive, self.free)
+        root = (weight * self.number_shares) ** 0.5
+        rows = (self.rows, (roots[:, :, None] * of_bodies).reshape(-1, p), root[:, None] * of_positive, self.free)
         off = roots * (L.swapaxes(1, 2) @ self.inverse @ L - np.eye(4)).reshape(bodies, 16)
         residual = (self.rows @ (x - self.measured), off.ravel(), root * (numbers / self.sizes - 1), self.free @ x)
         return np.vstack(rows), np.concatenate(residual)

@@ -2,47 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ckc_pin.base.arrays import Array
 from ckc_pin.identification.result import Identification
+from ckc_pin.identification.unknowns import link_inertial_axes
+from ckc_pin.mechanism.parameters import AXES, INERTIA_ENTRIES
 from ckc_pin.run.columns import list_quantities
 from ckc_pin.view import style
-from ckc_pin.view.layout import write_figure
 from ckc_pin.view.style import escape_mathtext, figure_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_identification", "save_identification"]
+__all__ = ["compute_ellipsoid", "draw_identification"]
 
 MAX_LAGS = 50
 CONFIDENCE = 1.96  # standard deviations of the autocorrelation of independent residuals
 MAX_LABELS = 30
 LABEL_WIDTH = 2.4  # inches, of names and the scale beside a matrix
+ELLIPSOID_COLUMNS = 4
 POINTS = 4000  # of a curve
 
 
-def save_identification(result: Identification, folder: Path) -> list[Path]:
-    """Write torques.png or motion.png, residuals.png and, for two parameters or more, correlation.png.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written; matplotlib is not installed.
-    """
-    return [
-        path
-        for name, figure in draw_identification(result).items()
-        for path in write_figure(figure, folder, name, ("png",))
-    ]
-
-
 def draw_identification(result: Identification) -> dict[str, Figure]:
-    """Return the figures "torques" or "motion", "residuals" and, for two parameters or more, "correlation".
+    """Return the figures "torques" or "motion", and "residuals".
+
+    There is "correlation" for two parameters or more, and "ellipsoids" for links of unknown inertia.
 
     Raises
     ------
@@ -53,6 +42,8 @@ def draw_identification(result: Identification) -> dict[str, Figure]:
         figures = {result.method: _draw_predictions(result), "residuals": _draw_residuals(result)}
         if len(result.identified) > 1:
             figures["correlation"] = _draw_correlation(result)
+        if links := _links(result):
+            figures["ellipsoids"] = _draw_ellipsoids(result, links)
         return figures
 
 
@@ -132,3 +123,57 @@ def _draw_correlation(result: Identification) -> Figure:
     ax.grid(visible=False)
     ax.set_title("Errors of the identified parameters", loc="left")
     return figure
+
+
+def _links(result: Identification) -> list[str]:
+    """Return the links with an inertia that is estimated, if there is a complete set of values."""
+    ends = {name.removesuffix(".inertia.ixx") for name in result.values if name.endswith(".inertia.ixx")}
+    return [
+        name.removesuffix(".mass").removeprefix("link.") for name in result.values if name.removesuffix(".mass") in ends
+    ]
+
+
+def _draw_ellipsoids(result: Identification, links: Sequence[str]) -> Figure:
+    """Draw the ellipsoid of constant density of each link, before and after, in the plane where it is longest."""
+    from matplotlib.figure import Figure
+
+    columns = min(len(links), ELLIPSOID_COLUMNS)
+    rows = -(-len(links) // columns)
+    figure = Figure(figsize=(1.0 + 1.9 * columns, 0.6 + 1.9 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    angle = np.linspace(0, 2 * np.pi, 100)
+    circle = np.array([np.cos(angle), np.sin(angle)])
+    starts = {name: x.start for name, x in result.parameters.items()}
+    for ax, link in zip(panels, links, strict=False):
+        axes = link_inertial_axes(result.mechanism, link)
+        solids = [compute_ellipsoid(link, numbers, axes) for numbers in (starts, result.values)]
+        extent = np.max([np.abs(np.diagonal(spread)) for _, spread in solids], axis=0)
+        plane = np.sort(np.argsort(-extent)[:2])
+        for (centre, spread), colour, style_, label in zip(solids, ("0.5", style.COLOURS[0]), ("--", "-"),
+                                                           ("start", "estimate"), strict=True):  # fmt: skip
+            values, vectors = np.linalg.eigh(spread[np.ix_(plane, plane)])
+            outline = centre[plane, None] + (vectors * np.sqrt(np.maximum(values, 0.0))) @ circle
+            ax.plot(*outline, style_, color=colour, linewidth=1.2, label=label)
+            ax.plot(*centre[plane, None], ".", color=colour, markersize=4)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_title(escape_mathtext(link), loc="left", fontsize=8)
+        ax.set_xlabel(f"{AXES[plane[0]]} (m)", fontsize=7)
+        ax.set_ylabel(f"{AXES[plane[1]]} (m)", fontsize=7)
+        ax.tick_params(labelsize=6)
+        ax.locator_params(nbins=3)
+    for ax in panels[len(links) :]:
+        ax.set_axis_off()
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2, fontsize=8)
+    return figure
+
+
+def compute_ellipsoid(link: str, numbers: Mapping[str, float], axes: Array) -> tuple[Array, Array]:
+    """Return centre and squared semi-axes, as a matrix in the link's axes, of the ellipsoid of constant density."""
+    inertia = np.zeros((3, 3))
+    for entry, (i, j) in INERTIA_ENTRIES.items():
+        inertia[i, j] = inertia[j, i] = numbers[f"link.{link}.inertia.{entry}"]
+    inertia = axes @ inertia @ axes.T
+    moments = np.trace(inertia) / 2 * np.eye(3) - inertia
+    mass = numbers[f"link.{link}.mass"]
+    centre = np.array([numbers[f"link.{link}.com.{axis}"] for axis in AXES])
+    return centre, 5 * moments / mass if mass > 0 else np.zeros((3, 3))

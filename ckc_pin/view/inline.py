@@ -44,7 +44,7 @@ if TYPE_CHECKING:
         | xarray.Dataset
     )
 
-__all__ = ["Figures", "Playback"]
+__all__ = ["Figures", "Playback", "render_image"]
 
 PLAYBACK_HEIGHT_PX = 480
 FIGURE_DPI = 100
@@ -104,7 +104,7 @@ class Figures(Mapping[str, "Figure"]):
         return f"Figures({', '.join(self)})"
 
     def _repr_html_(self) -> str:
-        return "\n".join(_render_image(name, figure) for name, figure in self._figures.items())
+        return "\n".join(render_image(name, figure) for name, figure in self._figures.items())
 
     def save(self, out_dir: str | Path, formats: Sequence[str] = ("png",)) -> list[Path]:
         """Write the figures to a folder, which is created if missing; formats are "png", "svg" and "pdf".
@@ -180,7 +180,8 @@ def _is_dataset(result: Any) -> bool:
     return module is not None and isinstance(result, module.Dataset)
 
 
-def _render_image(name: str, figure: Figure) -> str:
+def render_image(name: str, figure: Figure) -> str:
+    """Return a figure as an HTML element that contains its PNG."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=FIGURE_DPI)
     data = b64encode(file.getvalue()).decode()

@@ -79,7 +79,7 @@ class Case:
 
 CASES = {
     "five_bar": Case(
-        ((0.4, 2.5), (0.25, 7.5), (0.1, 12.5)), 1e-4, 0.01,
+        ((0.25, 2.5), (0.15, 7.5), (0.05, 12.5)), 1e-4, 0.01,
         {f"joint.theta_{k}.{key}": x for k in (1, 2, 3, 4)
          for key, x in (("friction", 0.05 - 0.03 * (k % 2 == 0)), ("damping", 0.02 - 0.01 * (k % 2 == 0)))},
         ("link.*.inertial", "joint.*.friction", "joint.*.damping"), ("link.link_2.inertial", "joint.*.damping"),

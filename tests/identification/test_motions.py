@@ -271,6 +271,7 @@ def test_command_writes_result_parameters_and_figures(tmp_path):
     assert set(done.json["residuals"]) == set(done.json["validation"]) == {"theta_1", "theta_3"}
     assert done.json["residuals"]["theta_1"]["expected"] == 1e-4
     assert done.json["parameters"]["joint.theta_1.friction"]["value"] == pytest.approx(0.02, abs=1e-3)
+    assert "Measured and predicted quantities" in (tmp_path / "o" / "report.html").read_text(encoding="utf-8")
     for figure in ("motion", "residuals", "correlation"):
         assert (tmp_path / "o" / f"{figure}.png").stat().st_size > 5000
     values = tomllib.loads((tmp_path / "o" / "parameters.toml").read_text())["parameters"]

@@ -334,10 +334,45 @@ def test_command_writes_result_parameters_and_figures(tmp_path):
         "value": None, "std": None, "start": 0.2451, "verdict": "not identifiable",
         "missing": "no motion of this mechanism determines it"}  # fmt: skip
     assert done.json["parameters"]["joint.theta_1.friction"]["value"] == pytest.approx(0.05, abs=0.02)
-    for figure in ("torques", "residuals", "correlation"):
+    for figure in ("torques", "residuals", "correlation", "ellipsoids"):
         assert (tmp_path / "o" / f"{figure}.png").stat().st_size > 5000
+    page = (tmp_path / "o" / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 4
+    assert "swing.csv, other.csv (validation)" in page
+    assert "no motion of this mechanism determines it alone" in page
+    assert "http" not in page.replace("http-equiv", "")
     import tomllib
 
     values = tomllib.loads((tmp_path / "o" / "parameters.toml").read_text())["parameters"]
     assert load("five_bar", values).d == 2
     assert len(MOMENTS) * 4 + 8 == len(values)
+
+
+def test_report_escapes_names():
+    from dataclasses import replace
+
+    from ckc_pin.view.report_page import render_report
+
+    result = identify("five_bar", record("five_bar", 1e-4, 0.01), PARAMETERS)
+    name = "<script>alert(1)</script>"
+    motions = tuple(replace(x, source=name) for x in result.motions)
+    warned = replace(
+        result, motions=motions, warnings=(name,), parameters={name: result.parameters["link.link_1.mass"]}
+    )
+    page = render_report(warned, {})
+    assert name not in page
+    assert page.count("&lt;script&gt;") == 3
+    assert "Figures need matplotlib" in page
+
+
+def test_ellipsoid_of_a_homogeneous_body_is_its_shape():
+    """Semi-axes 3, 2 and 1 have the moments m (b^2 + c^2) / 5."""
+    from ckc_pin.view.identification_figures import compute_ellipsoid
+
+    numbers = {"link.a.mass": 2.0, **{f"link.a.com.{axis}": x for axis, x in zip("xyz", (0.1, 0.2, 0.3), strict=True)}}
+    moments = {"ixx": 2 * 5 / 5, "iyy": 2 * 10 / 5, "izz": 2 * 13 / 5, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
+    numbers |= {f"link.a.inertia.{entry}": x for entry, x in moments.items()}
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    centre, spread = compute_ellipsoid("a", numbers, turn)
+    np.testing.assert_allclose(centre, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(spread, np.diag([4.0, 9.0, 1.0]), atol=1e-12)
