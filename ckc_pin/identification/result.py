@@ -21,6 +21,7 @@ from ckc_pin.identification.estimates import (
     IN_COMBINATION,
     NOT_IDENTIFIABLE,
     PRIOR_ONLY,
+    UNCHANGED,
     VERDICTS,
     Combination,
     Estimate,
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Identification", "Prediction", "Residual", "make_result"]
 
-UNCHANGED = 0.98  # standard deviation, relative to the prior's, with which the data add nothing to it
 MAX_MISFIT = 0.1  # of a gradient that follows from the equations of the prior, which are linearized at other values
 
 
