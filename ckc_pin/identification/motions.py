@@ -77,12 +77,12 @@ def identify_motion(
                 f"identify: {count} measurements for {needed} unknowns; record a longer motion or estimate less"
             )
         none = np.zeros((len(unknowns.names), 0))
-        known = make_prior(unknowns, prior)
+        prior_equations = make_prior(unknowns, prior)
         start = unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0))
-        fit = _Fit(unknowns, fitted, start, robust=robust, prior=known)
+        fit = _Fit(unknowns, fitted, start, robust=robust, prior=prior_equations)
         fit.solve()
         others = [
-            _Fit(unknowns, [x], fit.x, robust=robust, prior=known, starts_only=True)
+            _Fit(unknowns, [x], fit.x, robust=robust, prior=prior_equations, starts_only=True)
             for x in motions if x.record.validation
         ]  # fmt: skip
         for other in others:
@@ -99,7 +99,7 @@ def identify_motion(
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
         complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
-        prior=known, advice=advice,
+        prior=prior_equations, advice=advice,
     )  # fmt: skip
 
 
@@ -333,8 +333,8 @@ class _Fit:
 
     def _cost(self, predicted: Sequence[Array], stds: Sequence[Array], x: Array) -> float:
         rows, target = self.prior
-        known = float(np.sum((rows @ x - target) ** 2))
-        return known + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
+        of_prior = float(np.sum((rows @ x - target) ** 2))
+        return of_prior + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
 
     def _cost_of(self, motion: Motion, predicted: Array, stds: Array) -> float:
         sizes = np.abs(motion.values - predicted) / stds
@@ -367,8 +367,8 @@ class _Fit:
             rights.append(right - Q @ (Q.T @ right))
         A, b = np.concatenate(columns)[:, None], np.concatenate(rights)[:, None]
         rows, target = self.prior
-        known = rows, target - rows @ self.x
-        return fit_linear(A, b, known, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
+        remaining = rows, target - rows @ self.x
+        return fit_linear(A, b, remaining, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
 
     def _step(self, stds: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the steps of the unknowns and of the start of each record."""
