@@ -18,9 +18,9 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.identification.fit import HUBER, LinearFit, Prior, fit_linear
 from ckc_pin.identification.motion_runs import (
-    Motion,
     MotionRun,
     MotionUnknowns,
+    RecordedMotion,
     RunError,
     predict,
     read_motion,
@@ -31,7 +31,7 @@ from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record
 from ckc_pin.identification.regressor import TorqueRegressor, linear_parameters
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.structure import Advice, structural_directions
+from ckc_pin.identification.structure import MotionAdvice, structural_directions
 from ckc_pin.identification.unknowns import INERTIAL, Unknown, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
@@ -103,7 +103,7 @@ def identify_motion(
     )  # fmt: skip
 
 
-def _misfits(prediction: Prediction, motion: Motion) -> Iterator[str]:
+def _misfits(prediction: Prediction, motion: RecordedMotion) -> Iterator[str]:
     """Yield warnings about residuals that are much larger than the noise which the splines see."""
     for name, spline in motion.splines.items():
         k = prediction.quantities.index(name)
@@ -145,7 +145,7 @@ def _is_linear(mechanism: Mechanism, names: Sequence[str]) -> bool:
     return single <= {*linear_parameters(mechanism, ParameterMap(mechanism))}
 
 
-def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice | None:
+def _advise(unknowns: MotionUnknowns, motion: RecordedMotion, run: MotionRun) -> MotionAdvice | None:
     """Return what says which motions would determine parameters, if torques are linear in them."""
     mechanism = unknowns.mechanism
     names = [name for name in unknowns.names if ".moment." not in name and ".origin_inertia." not in name]
@@ -157,7 +157,7 @@ def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice 
     torques = [motion.record.values.get(f"tau.{motor}", np.zeros(1)) for motor in mechanism.motors.names]
     has_torques = any(np.any(np.nan_to_num(tau)) for tau in torques)
     regressor = TorqueRegressor(mechanism, names)
-    return Advice(regressor, q_tree, unknowns.names, has_torques=has_torques)
+    return MotionAdvice(regressor, q_tree, unknowns.names, has_torques=has_torques)
 
 
 def _rms(residual: Array) -> Array:
@@ -175,7 +175,7 @@ class _Fit:
     Parameters
     ----------
     unknowns : MotionUnknowns
-    motions : sequence of Motion
+    motions : sequence of RecordedMotion
     x : (p,) array
         Steps of the unknowns from their start, in typical sizes, to begin with.
     robust : bool
@@ -186,7 +186,7 @@ class _Fit:
     """
 
     def __init__(
-        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, prior: Prior,
+        self, unknowns: MotionUnknowns, motions: Sequence[RecordedMotion], x: Array, *, robust: bool, prior: Prior,
         starts_only: bool = False,
     ) -> None:  # fmt: skip
         self.unknowns, self.motions, self.x, self.prior = unknowns, motions, x, prior
@@ -336,7 +336,7 @@ class _Fit:
         of_prior = float(np.sum((rows @ x - target) ** 2))
         return of_prior + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
 
-    def _cost_of(self, motion: Motion, predicted: Array, stds: Array) -> float:
+    def _cost_of(self, motion: RecordedMotion, predicted: Array, stds: Array) -> float:
         sizes = np.abs(motion.values - predicted) / stds
         if self.robust:
             sizes = np.sqrt(np.where(sizes > HUBER, 2 * HUBER * sizes - HUBER**2, sizes**2))

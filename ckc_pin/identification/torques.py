@@ -16,7 +16,7 @@ from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.structure import Advice
+from ckc_pin.identification.structure import MotionAdvice
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["identify_torques"]
@@ -79,7 +79,7 @@ def identify_torques(
         step = fit.x
         if physical:
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
-        advice = Advice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
+        advice = MotionAdvice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
     motions = [_prediction(x, mechanism.motors.names, step, fit) for x in equations]
     return make_result(
         "torques", regressor, fit, regressor.start + regressor.scale * step, motions, leak=LEAK_TOLERANCE,
