@@ -48,7 +48,8 @@ if TYPE_CHECKING:
     from ckc_pin.ensembles.ensemble import ensemble
     from ckc_pin.errors import CkcError, InputError, MechanismError, NumericalError
     from ckc_pin.explorer.explore import Explorer, explore
-    from ckc_pin.identification.calibration import Calibration, calibrate
+    from ckc_pin.identification.calibration import calibrate
+    from ckc_pin.identification.calibration_result import Calibration
     from ckc_pin.identification.excitation import Excitation, excite
     from ckc_pin.identification.identify import identify
     from ckc_pin.identification.result import Identification
@@ -132,7 +133,7 @@ __version__ = "0.1.0"
 
 
 MODULES = {
-    "Calibration": "identification.calibration",
+    "Calibration": "identification.calibration_result",
     "Check": "analysis.check",
     "CkcError": "errors",
     "Controller": "control.controllers",

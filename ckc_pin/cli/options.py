@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 __all__ = ["PATH", "as_json", "complete_scenes", "csv", "figures", "format_examples", "mechanism", "open_browser",
-           "out", "overrides", "overwrite", "port", "read_overrides", "read_table", "require_folder", "require_speed",
+           "out", "overrides", "overrides_of_file",
+           "overwrite", "port", "read_overrides", "read_table", "require_folder", "require_speed",
            "runs"]  # fmt: skip
 
 MAX_QUOTED = 80  # characters of a user's text in a message
@@ -98,7 +99,7 @@ port = click.option("--port", metavar="PORT", type=int, default=0, help="Port on
 open_browser = click.option("--open", "open_browser", is_flag=True, help="Also open the default browser.")
 
 
-def overrides(command: Callable[..., Any]) -> Callable[..., Any]:
+def overrides(command: Callable[..., Any], file: str = "scene") -> Callable[..., Any]:
     """Add the options --set and --unset to a command, which gets both as one table `overrides`; None removes a key."""
 
     @click.option(
@@ -106,10 +107,10 @@ def overrides(command: Callable[..., Any]) -> Callable[..., Any]:
         "settings",
         metavar="KEY=VALUE",
         multiple=True,
-        help="Override a key of the scene or a parameter of the mechanism. May be repeated.",
+        help=f"Override a key of the {file} or a parameter of the mechanism. May be repeated.",
     )
     @click.option(
-        "--unset", "removed", metavar="KEY", multiple=True, help="Remove a key of the scene. May be repeated."
+        "--unset", "removed", metavar="KEY", multiple=True, help=f"Remove a key of the {file}. May be repeated."
     )
     @wraps(command)
     def with_overrides(*args: Any, settings: tuple[str, ...], removed: tuple[str, ...], **options: Any) -> Any:
@@ -122,6 +123,9 @@ def overrides(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(*args, overrides=values | dict.fromkeys(removed), **options)
 
     return with_overrides
+
+
+overrides_of_file = partial(overrides, file="file")
 
 
 def format_examples(*lines: str) -> str:

@@ -45,7 +45,7 @@ MIN_REDUNDANCY = 0.1  # of readings whose residuals tell of noise one by one
 SHARE_OF_NORMAL = 0.71016  # mean of min(x^2, HUBER^2) of a standard normal x
 CURVATURE = 0.1  # of an outlier's loss in a step, relative to reweighted least squares
 MAX_REJECTIONS = 10  # rounds
-REJECTED = 4.5  # standard deviations of a residual from which a robust fit leaves a reading out
+REJECTED = 3.5  # standard deviations of a residual from which a robust fit leaves a reading out
 POSE_TOLERANCE = 1e-4  # rad, or mechanism sizes: step that ends them
 HUBER = 1.345  # standard deviations: 95 % efficiency without outliers
 
@@ -435,15 +435,35 @@ class Fit:
         if self.huber:
             self.threshold = HUBER
             total += self._fit_and_estimate(estimated)
-            self.threshold = np.inf
-        for _ in range(MAX_REJECTIONS if self.huber else 0):
+            # The residual of a reading that hardly influences the fit has the standard deviation sigma / v, not
+            # sigma v, if the part v^2 of its error is visible in least squares.
             size = self.sizes(self.linear.residual)
-            worst = size >= np.maximum(size.max(axis=1, keepdims=True), REJECTED)
-            if not worst.any():
+            self._leave_out(size * np.where(size > self.threshold, self.visible**2, 1.0))
+            self.threshold = np.inf
+            total += self._fit_and_estimate(estimated)
+        for _ in range(MAX_REJECTIONS if self.huber else 0):
+            if not self._leave_out(self.sizes(self.linear.residual)):
                 break
-            self.present &= ~worst
+            total += self._fit_and_estimate(estimated)
+        if self.huber and self._reinstate():
             total += self._fit_and_estimate(estimated)
         return self.converged, total
+
+    def _leave_out(self, size: Array) -> bool:
+        """Leave out the worst reading of each pose if its residual has a large size; return whether any is left out."""
+        worst = self.present & (size >= np.maximum(size.max(axis=1, keepdims=True), REJECTED))
+        self.present &= ~worst
+        return bool(worst.any())
+
+    def _reinstate(self) -> bool:
+        """Take readings back that were left out because of others, and agree with the fit; return whether any does."""
+        kept, values = self.present, self.readings.values
+        self.present = np.isfinite(values)
+        self.linear = self.linearize(self.values, self.q_tree)
+        sizes = np.abs(self.linear.residual) * np.sqrt(self.redundancy()) / self.sigma
+        self.present = kept | (self.present & (sizes < REJECTED))
+        self.linear = self.linearize(self.values, self.q_tree)
+        return bool(np.any(self.present != kept))
 
     def _fit_and_estimate(self, estimated: list[BoolArray]) -> int:
         total = 0

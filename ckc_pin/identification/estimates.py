@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["BY_PRIOR", "IDENTIFIED", "IN_COMBINATION", "NOT_IDENTIFIABLE", "PRIOR_ONLY", "VERDICTS", "Combination",
-           "Estimate"]  # fmt: skip
+__all__ = ["BY_PRIOR", "IDENTIFIED", "IN_COMBINATION", "NOT_IDENTIFIABLE", "PRIOR_ONLY", "UNCHANGED", "VERDICTS",
+           "Combination", "Estimate"]  # fmt: skip
 
 IDENTIFIED, BY_PRIOR, PRIOR_ONLY = "identified", "identified with a prior", "prior only"
 IN_COMBINATION, NOT_IDENTIFIABLE = "only in a combination", "not identifiable"
+UNCHANGED = 0.98  # standard deviation, relative to the prior's, with which measurements add nothing to it
 VERDICTS = (IDENTIFIED, BY_PRIOR, PRIOR_ONLY, IN_COMBINATION, NOT_IDENTIFIABLE)
 
 

@@ -27,13 +27,21 @@ from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.scene import Scene
 from ckc_pin.sensitivity.sensitivities import sensitivities
 
-__all__ = ["Motion", "MotionRun", "MotionUnknowns", "RunError", "predict", "read_motion", "simulate_with_derivatives"]
+__all__ = [
+    "MotionRun",
+    "MotionUnknowns",
+    "RecordedMotion",
+    "RunError",
+    "predict",
+    "read_motion",
+    "simulate_with_derivatives",
+]
 
 RTOL = 1e-10  # of runs
 
 
 @dataclass(frozen=True, eq=False)
-class Motion(Immutable):
+class RecordedMotion(Immutable):
     """One record, and what its runs need.
 
     Attributes
@@ -60,7 +68,7 @@ class Motion(Immutable):
     q_dot: Array
     splines: Mapping[str, SplineFit]
 
-    def until(self, part: float) -> Motion:
+    def until(self, part: float) -> RecordedMotion:
         """Return the first part of the record."""
         return replace(self, values=np.where(self.t <= part * np.nanmax(self.t), self.values, np.nan))
 
@@ -105,7 +113,7 @@ class RunError(Exception):
 # --- records ---------------------------------------------------------------------------------------
 
 
-def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> Motion:
+def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> RecordedMotion:
     """Return a record with the torques of its run, and estimate its start."""
     coordinates = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
@@ -145,7 +153,7 @@ def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> Mo
     splines = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in chosen}
     q, q_dot = estimate_start(mechanism, splines, first)
     controller = _interpolated(list(series.values()), first) if series else None
-    return Motion(record, names, t - first, values, controller, q, q_dot, splines)
+    return RecordedMotion(record, names, t - first, values, controller, q, q_dot, splines)
 
 
 def _measured(record: Record, name: str) -> tuple[Array, Array]:
@@ -167,7 +175,9 @@ def _interpolated(series: Sequence[tuple[Array, Array]], first: float) -> Record
 # --- runs ------------------------------------------------------------------------------------------
 
 
-def simulate_with_derivatives(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> MotionRun:
+def simulate_with_derivatives(
+    unknowns: MotionUnknowns, motion: RecordedMotion, x: Array, q: Array, q_dot: Array
+) -> MotionRun:
     """Simulate a record from a start, with unknowns that are x typical sizes off theirs.
 
     Raises
@@ -197,7 +207,7 @@ def simulate_with_derivatives(unknowns: MotionUnknowns, motion: Motion, x: Array
     return MotionRun(result.run.q_tree, q_dot, predicted, by_unknown, by_start)
 
 
-def predict(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot: Array) -> Array:
+def predict(unknowns: MotionUnknowns, motion: RecordedMotion, x: Array, q: Array, q_dot: Array) -> Array:
     """Return the measured quantities of a run without derivatives, (m, k) (RunError)."""
     parameters = unknowns.parameters_at(unknowns.start + unknowns.scale * x)
     instants, rows = _instants(motion)
@@ -209,7 +219,7 @@ def predict(unknowns: MotionUnknowns, motion: Motion, x: Array, q: Array, q_dot:
     return _outputs(run, motion, rows)
 
 
-def _instants(motion: Motion) -> tuple[Array, IntArray]:
+def _instants(motion: RecordedMotion) -> tuple[Array, IntArray]:
     """Return the instants of a record's measurements with t = 0, and the row of each measurement (m, k)."""
     measured = np.isfinite(motion.values)
     instants, inverse = np.unique(np.append(motion.t[measured], 0.0), return_inverse=True)
@@ -219,7 +229,12 @@ def _instants(motion: Motion) -> tuple[Array, IntArray]:
 
 
 def _make_scene(
-    mechanism: Mechanism, motion: Motion, parameters: Sequence[ParameterValue], q: Array, q_dot: Array, t_end: float
+    mechanism: Mechanism,
+    motion: RecordedMotion,
+    parameters: Sequence[ParameterValue],
+    q: Array,
+    q_dot: Array,
+    t_end: float,
 ) -> Scene:
     return Scene(
         mechanism, t_end=max(t_end, 1e-9), formulation="dae", controller=motion.controller,
@@ -239,7 +254,7 @@ def _overrides(mechanism: Mechanism, parameters: Sequence[ParameterValue]) -> di
     return values
 
 
-def _outputs(run: Run, motion: Motion, rows: IntArray) -> Array:
+def _outputs(run: Run, motion: RecordedMotion, rows: IntArray) -> Array:
     """Return the measured quantities of a run at given rows, (m, k) (RunError)."""
     if run.status != "done":
         raise RunError(f"the run {run.message}")

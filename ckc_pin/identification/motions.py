@@ -18,9 +18,9 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.identification.fit import HUBER, LinearFit, Prior, fit_linear
 from ckc_pin.identification.motion_runs import (
-    Motion,
     MotionRun,
     MotionUnknowns,
+    RecordedMotion,
     RunError,
     predict,
     read_motion,
@@ -31,7 +31,7 @@ from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record
 from ckc_pin.identification.regressor import TorqueRegressor, linear_parameters
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.structure import Advice, structural_directions
+from ckc_pin.identification.structure import MotionAdvice, structural_directions
 from ckc_pin.identification.unknowns import INERTIAL, Unknown, expand_names, moment_unknowns, typical_size
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import ParameterMap
@@ -77,12 +77,12 @@ def identify_motion(
                 f"identify: {count} measurements for {needed} unknowns; record a longer motion or estimate less"
             )
         none = np.zeros((len(unknowns.names), 0))
-        known = make_prior(unknowns, prior)
+        prior_equations = make_prior(unknowns, prior)
         start = unknowns.nearest_physical(np.zeros(len(none)), none, np.zeros(0))
-        fit = _Fit(unknowns, fitted, start, robust=robust, prior=known)
+        fit = _Fit(unknowns, fitted, start, robust=robust, prior=prior_equations)
         fit.solve()
         others = [
-            _Fit(unknowns, [x], fit.x, robust=robust, prior=known, starts_only=True)
+            _Fit(unknowns, [x], fit.x, robust=robust, prior=prior_equations, starts_only=True)
             for x in motions if x.record.validation
         ]  # fmt: skip
         for other in others:
@@ -99,11 +99,11 @@ def identify_motion(
     return make_result(
         "motion", unknowns, fit.linear(), unknowns.start + unknowns.scale * fit.x, predictions, leak=LEAK_TOLERANCE,
         complete=True, instants=sum(int(np.isfinite(x.values).any(axis=1).sum()) for x in fitted), warnings=warnings,
-        prior=known, advice=advice,
+        prior=prior_equations, advice=advice,
     )  # fmt: skip
 
 
-def _misfits(prediction: Prediction, motion: Motion) -> Iterator[str]:
+def _misfits(prediction: Prediction, motion: RecordedMotion) -> Iterator[str]:
     """Yield warnings about residuals that are much larger than the noise which the splines see."""
     for name, spline in motion.splines.items():
         k = prediction.quantities.index(name)
@@ -145,7 +145,7 @@ def _is_linear(mechanism: Mechanism, names: Sequence[str]) -> bool:
     return single <= {*linear_parameters(mechanism, ParameterMap(mechanism))}
 
 
-def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice | None:
+def _advise(unknowns: MotionUnknowns, motion: RecordedMotion, run: MotionRun) -> MotionAdvice | None:
     """Return what says which motions would determine parameters, if torques are linear in them."""
     mechanism = unknowns.mechanism
     names = [name for name in unknowns.names if ".moment." not in name and ".origin_inertia." not in name]
@@ -157,7 +157,7 @@ def _advise(unknowns: MotionUnknowns, motion: Motion, run: MotionRun) -> Advice 
     torques = [motion.record.values.get(f"tau.{motor}", np.zeros(1)) for motor in mechanism.motors.names]
     has_torques = any(np.any(np.nan_to_num(tau)) for tau in torques)
     regressor = TorqueRegressor(mechanism, names)
-    return Advice(regressor, q_tree, unknowns.names, has_torques=has_torques)
+    return MotionAdvice(regressor, q_tree, unknowns.names, has_torques=has_torques)
 
 
 def _rms(residual: Array) -> Array:
@@ -175,7 +175,7 @@ class _Fit:
     Parameters
     ----------
     unknowns : MotionUnknowns
-    motions : sequence of Motion
+    motions : sequence of RecordedMotion
     x : (p,) array
         Steps of the unknowns from their start, in typical sizes, to begin with.
     robust : bool
@@ -186,7 +186,7 @@ class _Fit:
     """
 
     def __init__(
-        self, unknowns: MotionUnknowns, motions: Sequence[Motion], x: Array, *, robust: bool, prior: Prior,
+        self, unknowns: MotionUnknowns, motions: Sequence[RecordedMotion], x: Array, *, robust: bool, prior: Prior,
         starts_only: bool = False,
     ) -> None:  # fmt: skip
         self.unknowns, self.motions, self.x, self.prior = unknowns, motions, x, prior
@@ -333,10 +333,10 @@ class _Fit:
 
     def _cost(self, predicted: Sequence[Array], stds: Sequence[Array], x: Array) -> float:
         rows, target = self.prior
-        known = float(np.sum((rows @ x - target) ** 2))
-        return known + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
+        of_prior = float(np.sum((rows @ x - target) ** 2))
+        return of_prior + sum(self._cost_of(*parts) for parts in zip(self.motions, predicted, stds, strict=True))
 
-    def _cost_of(self, motion: Motion, predicted: Array, stds: Array) -> float:
+    def _cost_of(self, motion: RecordedMotion, predicted: Array, stds: Array) -> float:
         sizes = np.abs(motion.values - predicted) / stds
         if self.robust:
             sizes = np.sqrt(np.where(sizes > HUBER, 2 * HUBER * sizes - HUBER**2, sizes**2))
@@ -367,8 +367,8 @@ class _Fit:
             rights.append(right - Q @ (Q.T @ right))
         A, b = np.concatenate(columns)[:, None], np.concatenate(rights)[:, None]
         rows, target = self.prior
-        known = rows, target - rows @ self.x
-        return fit_linear(A, b, known, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
+        remaining = rows, target - rows @ self.x
+        return fit_linear(A, b, remaining, noise=np.ones((len(A), 1, 1)), smallest=COLUMN_TOLERANCE * largest)
 
     def _step(self, stds: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the steps of the unknowns and of the start of each record."""

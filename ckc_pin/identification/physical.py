@@ -30,8 +30,8 @@ CENTRED, CONVERGED = 0.25, 1e-12  # largest decrement at the end of a weight, an
 ROUNDING = 1e-14  # relative to the value: a smaller decrease cannot be seen
 MIN_DECREASE = 0.1  # of a step, relative to that of the quadratic model
 LENGTHS = 0.5 ** np.arange(21)  # of steps, relative
-SMALL = 1e-6  # eigenvalue in typical sizes, of links without mass or thickness
-FLAT = 1e-3  # smallest eigenvalue of a prior of links with mass but without thickness
+MIN_EIGENVALUE = 1e-6  # eigenvalue in typical sizes, of links without mass or thickness
+MIN_THICKNESS = 1e-3  # smallest eigenvalue of a prior of links with mass but without thickness
 MASSLESS_WEIGHT = 1e-5  # of the divergence of links without mass, relative: they can grow to what is measured
 ZERO, ZERO_WEIGHT = 1e-3, 1e-2  # typical sizes of positive numbers that start at zero, and their weight, relative
 MIN_COLUMN = 1e-6  # makes steps of unknowns zero that neither the measurements nor a divergence determine
@@ -115,8 +115,10 @@ class _Problem:
         self.basis = basis() * scale[self.at][..., None, None] / (unit[:, None, :, None] * unit[:, None, None, :])
         self.offset = np.einsum("li,lijk->ljk", (start / scale)[self.at], self.basis)
         values, axes = np.linalg.eigh(self.offset)
-        has_mass = values[:, -1:] > SMALL
-        values = np.where(values < SMALL, np.where(has_mass, FLAT * values[:, -1:], SMALL), values)
+        has_mass = values[:, -1:] > MIN_EIGENVALUE
+        values = np.where(
+            values < MIN_EIGENVALUE, np.where(has_mass, MIN_THICKNESS * values[:, -1:], MIN_EIGENVALUE), values
+        )
         priors = (axes * values[:, None, :]) @ axes.swapaxes(1, 2)
         self.inverse = np.linalg.inv(priors)
         self.shares = np.where(has_mass[:, 0], 1.0, MASSLESS_WEIGHT)  # of the weight, by link
@@ -147,8 +149,8 @@ class _Problem:
         """
         p, bodies, roots = len(x), len(self.at), (weight * self.shares)[:, None] ** 0.5
         L = np.linalg.cholesky(self._pseudo_inertias(x))
-        left = np.linalg.solve(L[:, None], self.basis)
-        factors = np.linalg.solve(L[:, None], left.swapaxes(2, 3)).reshape(bodies, 10, 16).swapaxes(1, 2)
+        half = np.linalg.solve(L[:, None], self.basis)
+        factors = np.linalg.solve(L[:, None], half.swapaxes(2, 3)).reshape(bodies, 10, 16).swapaxes(1, 2)
         of_bodies = np.zeros((bodies, 16, p))
         np.put_along_axis(of_bodies, np.repeat(self.at[:, None], 16, axis=1), factors, axis=2)
         numbers = self.first + x[self.positive]

@@ -21,13 +21,14 @@ from ckc_pin.identification.estimates import (
     IN_COMBINATION,
     NOT_IDENTIFIABLE,
     PRIOR_ONLY,
+    UNCHANGED,
     VERDICTS,
     Combination,
     Estimate,
 )
 from ckc_pin.identification.fit import LinearFit, Prior
 from ckc_pin.identification.pseudo_inertia import pseudo_inertia
-from ckc_pin.identification.structure import Advice
+from ckc_pin.identification.structure import MotionAdvice
 from ckc_pin.identification.unknowns import Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Identification", "Prediction", "Residual", "make_result"]
 
-UNCHANGED = 0.98  # standard deviation, relative to the prior's, with which the data add nothing to it
 MAX_MISFIT = 0.1  # of a gradient that follows from the equations of the prior, which are linearized at other values
 
 
@@ -215,7 +215,7 @@ class Identification(HasSummary):
 
 def make_result(
     method: str, unknowns: Unknowns, fit: LinearFit, values: Array, motions: Sequence[Prediction], *, leak: float,
-    complete: bool, instants: int, warnings: Sequence[str], prior: Prior, advice: Advice | None,
+    complete: bool, instants: int, warnings: Sequence[str], prior: Prior, advice: MotionAdvice | None,
 ) -> Identification:  # fmt: skip
     """Return the result of a fit.
 
@@ -228,7 +228,7 @@ def make_result(
     complete : bool
         Whether the values are those of a mechanism that can exist.
     prior : Prior
-    advice : Advice or None
+    advice : MotionAdvice or None
         Says which motion would determine a parameter; None if the measurements are not linear in the parameters.
     """
     covariance = fit.covariance * np.outer(unknowns.scale, unknowns.scale)

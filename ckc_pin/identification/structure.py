@@ -15,7 +15,7 @@ from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.unknowns import GRAVITY
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["Advice", "random_states", "structural_directions"]
+__all__ = ["MotionAdvice", "random_states", "structural_directions"]
 
 AMPLITUDES = (0.5, 0.25, 0.1, 0.03, 0.01, 0.003)  # rad or sizes of the mechanism; the first that the loops allow
 MAX_STEP = 0.1  # the same, of a step towards a random configuration
@@ -66,7 +66,7 @@ def structural_directions(regressor: TorqueRegressor) -> Array:
     return np.asarray(v[: int(np.sum(s > STRUCTURAL_RANK_TOLERANCE * max(float(s.max(initial=0.0)), 1e-300)))].T)
 
 
-class Advice:
+class MotionAdvice:
     """Says why a motion does not determine a parameter, and which motion would.
 
     Parameters

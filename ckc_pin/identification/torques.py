@@ -16,7 +16,7 @@ from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.structure import Advice
+from ckc_pin.identification.structure import MotionAdvice
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["identify_torques"]
@@ -59,19 +59,19 @@ def identify_torques(
 ) -> Identification:  # fmt: skip
     """Estimate parameters in which torques are linear (InputError)."""
     regressor = TorqueRegressor(mechanism, parameters)
-    known = make_prior(regressor, prior)
+    prior_equations = make_prior(regressor, prior)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
         records = [_with_delay(mechanism, regressor, record, warnings) for record in records]
         equations = [_equations(mechanism, regressor, record, warnings) for record in records]
         fitted = [x for x in equations if not x.record.validation]
         columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
-        if right.size + len(known[0]) < columns.shape[2]:
+        if right.size + len(prior_equations[0]) < columns.shape[2]:
             raise InputError(
                 f"identify: {right.size} equations for {columns.shape[2]} unknowns; record a longer motion or estimate "
                 "less"
             )
-        fit = fit_linear(columns, right, known, robust=robust)
+        fit = fit_linear(columns, right, prior_equations, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
         fit = fit.with_errors(
             [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
@@ -79,11 +79,11 @@ def identify_torques(
         step = fit.x
         if physical:
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
-        advice = Advice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
+        advice = MotionAdvice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
     motions = [_prediction(x, mechanism.motors.names, step, fit) for x in equations]
     return make_result(
         "torques", regressor, fit, regressor.start + regressor.scale * step, motions, leak=LEAK_TOLERANCE,
-        complete=physical, instants=len(right), warnings=warnings, prior=known, advice=advice,
+        complete=physical, instants=len(right), warnings=warnings, prior=prior_equations, advice=advice,
     )  # fmt: skip
 
 

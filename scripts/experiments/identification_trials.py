@@ -24,7 +24,7 @@ from ckc_pin.formats.importing import import_texts
 from ckc_pin.identification.motions import make_unknowns
 from ckc_pin.identification.regressor import TorqueRegressor
 
-__all__ = ["CASES", "Outcome", "main", "run_trials"]
+__all__ = ["CASES", "TrialCounts", "main", "run_trials"]
 
 EXPECTED = 0.9545  # of a normal variable within two standard deviations
 LEG = """<robot name="leg"><link name="base"/>
@@ -99,7 +99,7 @@ CASES = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialCounts:
     """Counts of a case.
 
     Attributes
@@ -203,7 +203,7 @@ def measure_motion(name: str, seed: int) -> dict[str, Array]:
     return data | {f"tau.{motor}": x for motor, x in zip(mechanism.motors.names, tau.T, strict=True)}
 
 
-def run_trials(name: str, method: str, trials: int, first: int = 0) -> Outcome:
+def run_trials(name: str, method: str, trials: int, first: int = 0) -> TrialCounts:
     """Run trials with other noise each, and compare errors with standard deviations."""
     mechanism, case = load_case(name), CASES[name]
     names = case.of_motion if method == "motion" else case.parameters
@@ -218,7 +218,7 @@ def run_trials(name: str, method: str, trials: int, first: int = 0) -> Outcome:
     shares = np.array([np.mean(x <= 2) for x in ratios])
     error = 4 * float(shares.std(ddof=1) if trials > 1 else 0.0) / trials**0.5
     together = np.concatenate(ratios)
-    return Outcome(
+    return TrialCounts(
         trials, int(np.sum(together <= 2)), len(together), float(np.sqrt(np.mean(together**2))),
         (EXPECTED - error, EXPECTED + error),
     )  # fmt: skip

@@ -25,7 +25,8 @@ CASES = [
         ["rnu"],
         [
             "No such command 'rnu'",
-            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify, plot,",
+            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify, "
+            "calibrate, plot,",
         ],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
@@ -78,6 +79,8 @@ CASES = [
         ["excite", "five_bar", "--period", "0"],
         ["excite: period: expected a number of seconds above"],
     ),
+    Bad("no calibration", ["calibrate", "none.calibrate.toml"], ["none.calibrate.toml: no such calibration"]),
+    Bad("no identification", ["identify", "none.identify.toml"], ["none.identify.toml: no such identification"]),
     Bad("no parameters", ["excite", "five_bar", "--parameters", ","], ["excite: parameters: nothing to identify"]),
     Bad("no rate", ["excite", "five_bar", "--rate", "0"], ["--rate 0: expected a number above zero"]),
     Bad(
