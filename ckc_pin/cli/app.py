@@ -52,6 +52,7 @@ COMMANDS = {
     "sweep": "sweep:sweep",
     "excite": "excite:excite",
     "identify": "identification:identify",
+    "optimize": "optimize:optimize",
     "plot": "runs:plot",
     "play": "runs:play",
     "map": "analyses:map_",

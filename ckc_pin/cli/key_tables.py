@@ -14,11 +14,18 @@ from ckc_pin.ensembles.spec import SweepSpec
 from ckc_pin.errors import InputError
 from ckc_pin.identification.spec import IdentifySpec
 from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.optimization.spec import OptimizeSpec
 from ckc_pin.scene.spec import SceneSpec
 
 __all__ = ["FILES", "find_tables", "format_tables", "tables"]
 
-FILES: dict[str, Any] = {"mechanism": MechanismSpec, "scene": SceneSpec, "sweep": SweepSpec, "identify": IdentifySpec}
+FILES: dict[str, Any] = {
+    "mechanism": MechanismSpec,
+    "scene": SceneSpec,
+    "sweep": SweepSpec,
+    "identify": IdentifySpec,
+    "optimize": OptimizeSpec,
+}
 # Tables without a fixed structure: their contents decide which structure is read.
 OPEN = {(TrackingSpec, "desired"): (MotionSpec, TableSpec, PointPathSpec)}
 # Suffix of the path of such a table.
