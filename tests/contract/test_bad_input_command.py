@@ -25,7 +25,7 @@ CASES = [
         ["rnu"],
         [
             "No such command 'rnu'",
-            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify, optimize,",
+            "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify,",
         ],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),
