@@ -20,6 +20,7 @@ Subpackages, bottom to top; a module imports only from subpackages below its own
 `linear`, `sensitivity`      linear models and stability; derivatives of runs, Floquet multipliers
 `ensembles`                  many runs with different parameters
 `identification`             parameters from measurements, and motions that make them known
+`optimization`               planned motions
 `formats`, `analysis`        import and export; checks, singularity maps, work-precision reports
 `view`, `explorer`, `cli`    figures and 3-D playback; the explorer in the browser; the command `ckc`
 ============================ ==========================================================================
@@ -62,6 +63,8 @@ if TYPE_CHECKING:
     from ckc_pin.linear.stability_result import Stability
     from ckc_pin.mechanism import Mechanism
     from ckc_pin.mechanism.spec import Loop
+    from ckc_pin.optimization.optimize import optimize
+    from ckc_pin.optimization.plan import Plan
     from ckc_pin.run.events import Event
     from ckc_pin.run.inverse import inverse_dynamics
     from ckc_pin.run.ivp import as_ivp
@@ -96,6 +99,7 @@ __all__ = [
     "MechanismError",
     "MotionForces",
     "NumericalError",
+    "Plan",
     "Point",
     "Run",
     "Sampled",
@@ -120,6 +124,7 @@ __all__ = [
     "linearize",
     "load",
     "load_scene",
+    "optimize",
     "play",
     "plot",
     "sensitivities",
@@ -152,6 +157,7 @@ MODULES = {
     "MechanismError": "errors",
     "MotionForces": "run.motion_forces",
     "NumericalError": "errors",
+    "Plan": "optimization.plan",
     "Point": "kinematics.point",
     "Run": "run.run",
     "Sampled": "control.sampled",
@@ -176,13 +182,15 @@ MODULES = {
     "linearize": "linear.linearize",
     "load": "kinematics",
     "load_scene": "scene.scene",
+    "optimize": "optimization.optimize",
     "sensitivities": "sensitivity.sensitivities",
     "simulate": "run.simulate",
     "terms": "dynamics.terms",
 }
 ROOMS = (
     "analysis", "base", "codegen", "control", "dynamics", "ensembles", "errors", "explorer", "formats",
-    "identification", "kinematics", "linear", "mechanism", "native", "run", "scene", "sensitivity", "view",
+    "identification", "kinematics", "linear", "mechanism", "native", "optimization", "run", "scene", "sensitivity",
+    "view",
 )  # fmt: skip
 
 
@@ -265,6 +273,7 @@ def plot(
     | Sensitivities
     | MotionForces
     | Excitation
+    | Plan
     | SingularityMap
     | Identification
     | xarray.Dataset,

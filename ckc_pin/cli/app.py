@@ -53,6 +53,7 @@ COMMANDS = {
     "excite": "excite:excite",
     "identify": "identification:identify",
     "calibrate": "identification:calibrate",
+    "optimize": "optimize:optimize",
     "plot": "runs:plot",
     "play": "runs:play",
     "map": "analyses:map_",

@@ -159,11 +159,12 @@ def _announce_compilation(seconds: float) -> None:
     "table",
     metavar="[TABLE]",
     required=False,
-    help="A table, as motor, solver, controller.desired or tracking; or all tables of a file: mechanism, scene, sweep.",
+    help="A table, as motor, solver, controller.desired or tracking; or all tables of a file: mechanism, scene, sweep, identify, "
+    "calibrate, optimize.",
 )
 @options.as_json
 def keys(table: str | None, as_json: bool) -> None:
-    """Print the keys of mechanism, scene and sweep files.
+    """Print the keys of mechanism, scene, sweep, identification, calibration and optimization files.
 
     A line for each key says its type, its unit, its default and its meaning.
     """

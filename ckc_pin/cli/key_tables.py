@@ -14,6 +14,7 @@ from ckc_pin.ensembles.spec import SweepSpec
 from ckc_pin.errors import InputError
 from ckc_pin.identification.spec import CalibrateSpec, IdentifySpec
 from ckc_pin.mechanism.spec import MechanismSpec
+from ckc_pin.optimization.spec import OptimizeSpec
 from ckc_pin.scene.spec import SceneSpec
 
 __all__ = ["FILES", "find_tables", "format_tables", "tables"]
@@ -24,6 +25,7 @@ FILES: dict[str, Any] = {
     "sweep": SweepSpec,
     "identify": IdentifySpec,
     "calibrate": CalibrateSpec,
+    "optimize": OptimizeSpec,
 }
 # Tables without a fixed structure: their contents decide which structure is read.
 OPEN = {(TrackingSpec, "desired"): (MotionSpec, TableSpec, PointPathSpec)}

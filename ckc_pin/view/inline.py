@@ -16,6 +16,7 @@ from ckc_pin.identification.result import Identification
 from ckc_pin.kinematics.mapped import SingularityMap
 from ckc_pin.linear.linear_model import LinearModel
 from ckc_pin.linear.locus import GainLocus
+from ckc_pin.optimization.plan import Plan
 from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.run.run import Run
 from ckc_pin.sensitivity.sensitivities import Sensitivities
@@ -26,7 +27,7 @@ from ckc_pin.view.identification_figures import draw_identification
 from ckc_pin.view.linear_figures import draw_linear
 from ckc_pin.view.map_figures import draw_map
 from ckc_pin.view.player import render_html, write_page
-from ckc_pin.view.result_figures import draw_excitation, draw_motion_forces, draw_sensitivities
+from ckc_pin.view.result_figures import draw_excitation, draw_motion_forces, draw_plan, draw_sensitivities
 
 if TYPE_CHECKING:
     import xarray
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         | Sensitivities
         | MotionForces
         | Excitation
+        | Plan
         | SingularityMap
         | Identification
         | xarray.Dataset
@@ -48,7 +50,7 @@ __all__ = ["Figures", "Playback", "render_image"]
 
 PLAYBACK_HEIGHT_PX = 480
 FIGURE_DPI = 100
-DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, SingularityMap, Identification)
+DRAWN_ALONE = (LinearModel, GainLocus, Sensitivities, MotionForces, Excitation, Plan, SingularityMap, Identification)
 
 
 class Figures(Mapping[str, "Figure"]):
@@ -76,6 +78,8 @@ class Figures(Mapping[str, "Figure"]):
                 self._figures = draw_identification(result)
             case [Excitation() as result]:
                 self._figures = {"excite": draw_excitation(result)}
+            case [Plan() as result]:
+                self._figures = {"plan": draw_plan(result)}
             case [SingularityMap() as result]:
                 self._figures = {f"map_{result.space}": draw_map(result)}
             case [result] if _is_dataset(result):

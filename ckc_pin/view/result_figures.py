@@ -1,4 +1,4 @@
-"""Figures of inverse dynamics, of exciting motions, of sensitivities along a run, and of work-precision comparisons."""
+"""Figures of inverse dynamics, exciting and planned motions, sensitivities, and work-precision comparisons."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.identification.excitation import Excitation
+from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined, motor_units
+from ckc_pin.optimization.limits import quantity_names
+from ckc_pin.optimization.plan import Plan
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.motion_forces import MotionForces
 from ckc_pin.sensitivity.sensitivities import Sensitivities
 from ckc_pin.view import style
-from ckc_pin.view.layout import add_note, create_page, fit_legend, legend_line, write_figure
+from ckc_pin.view.layout import PanelSlot, add_note, create_page, fit_legend, legend_line, write_figure
 from ckc_pin.view.style import axis_label, coordinate_symbol, escape_mathtext, figure_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_excitation", "draw_motion_forces", "draw_precision", "draw_sensitivities", "save_motion_forces",
-           "save_precision", "save_sensitivities"]  # fmt: skip
+__all__ = ["draw_excitation", "draw_motion_forces", "draw_plan", "draw_precision", "draw_sensitivities",
+           "save_motion_forces", "save_precision", "save_sensitivities"]  # fmt: skip
 
 MAX_NOTE_MOTORS = 3  # named in a note; longer notes exceed the panel
 MAX_EXCITATION_ROWS = 1000
@@ -105,10 +108,11 @@ def _finish_axes(ax: Any, named_colours: dict[str, str], count: int) -> None:
     handles = [legend_line(colour, name) for name, colour in named_colours.items()]
     if count > len(named_colours):
         handles.append(legend_line(style.REST_COLOUR, f"{count - len(named_colours)} more"))
-    fit_legend(ax, handles)
+    if handles:
+        fit_legend(ax, handles)
 
 
-# --- excitation ----------------------------------------------------------------------------------
+# --- excitation and plans ------------------------------------------------------------------------
 
 
 def draw_excitation(excitation: Excitation) -> Figure:
@@ -128,19 +132,51 @@ def draw_excitation(excitation: Excitation) -> Figure:
         title = f"{escape_mathtext(mechanism.name)}: condition number {excitation.condition:.3g}"
         best = f"best of {excitation.random.count} random motions: {excitation.random.condition[0]:.3g}; dashed: limits"
         slots = create_page(title, best, ["motion", "motors"], 1, (style.WIDTH_IN, 2.4))
-        coordinate_units = dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
-        panels = ((mechanism.independent, "", "$q$", [coordinate_units[name] for name in mechanism.independent]),
-                  (mechanism.motors.names, "tau.", r"$\tau$", motor_units(mechanism)))  # fmt: skip
-        for slot, (names, prefix, symbol, units) in zip(slots, panels, strict=True):
-            named = style.select_largest({name: float(np.abs(columns[prefix + name]).max()) for name in names})
-            colours = style.assign_colours(named)
-            axes = slot.add_axes(len(set(units)))
-            for ax, unit in zip(axes, dict.fromkeys(units), strict=True):
-                for name in (name for name, other in zip(names, units, strict=True) if other == unit):
-                    _draw_between(ax, t, columns[prefix + name], bounds[prefix + name], colours.get(name))
-                ax.set_ylabel(axis_label(symbol, unit))
-            _finish_axes(axes[-1], {coordinate_symbol(name): colours[name] for name in named}, len(names))
+        _draw_coordinates_and_motors(slots, mechanism, t, columns, bounds)
         return slots[0].figure
+
+
+def draw_plan(plan: Plan) -> Figure:
+    """Return the figure of a plan: independent coordinates, motor torques with their limits, and margin to singularity.
+
+    Raises
+    ------
+    InputError
+        matplotlib is not installed.
+    """
+    mechanism, t = plan.mechanism, plan.t
+    bounds = dict(zip(quantity_names(mechanism), zip(*plan.limits.bounds(), strict=True), strict=True))
+    with figure_style():
+        title = f"{escape_mathtext(mechanism.name)}: planned motion of {plan.t_end:.4g} s"
+        titles = ["motion", "motors", "distance from singularities"]
+        slots = create_page(title, "dashed: limits", titles, 1, (style.WIDTH_IN, 2.4))
+        _draw_coordinates_and_motors(slots[:2], mechanism, t, plan.columns(), bounds)
+        ax = slots[2].add_axes()[0]
+        limit = plan.limits.singularity or -np.inf
+        _draw_between(ax, t, plan.margin, (limit, np.inf), style.COLOURS[0])
+        ax.set_ylim(bottom=0.0)
+        ax.set_ylabel(r"$\sigma_{\min}(\varphi_z)$ / start's")
+        _finish_axes(ax, {}, 0)
+        return slots[0].figure
+
+
+def _draw_coordinates_and_motors(
+    slots: Sequence[PanelSlot], mechanism: Mechanism, t: Array, columns: Mapping[str, Array],
+    bounds: Mapping[str, tuple[float, float]],
+) -> None:  # fmt: skip
+    """Draw the independent coordinates and the motor torques, with their limits, into two slots."""
+    coordinate_units = dict(zip(mechanism.coordinates, mechanism.tree.units(), strict=True))
+    panels = ((mechanism.independent, "", "$q$", [coordinate_units[name] for name in mechanism.independent]),
+              (mechanism.motors.names, "tau.", r"$\tau$", motor_units(mechanism)))  # fmt: skip
+    for slot, (names, prefix, symbol, units) in zip(slots, panels, strict=True):
+        named = style.select_largest({name: float(np.abs(columns[prefix + name]).max()) for name in names})
+        colours = style.assign_colours(named)
+        axes = slot.add_axes(len(set(units)))
+        for ax, unit in zip(axes, dict.fromkeys(units), strict=True):
+            for name in (name for name, other in zip(names, units, strict=True) if other == unit):
+                _draw_between(ax, t, columns[prefix + name], bounds[prefix + name], colours.get(name))
+            ax.set_ylabel(axis_label(symbol, unit))
+        _finish_axes(axes[-1], {coordinate_symbol(name): colours[name] for name in named}, len(names))
 
 
 def _draw_between(ax: Any, t: Array, curve: Array, limits: tuple[float, float], colour: str | None) -> None:

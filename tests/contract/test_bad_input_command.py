@@ -26,7 +26,7 @@ CASES = [
         [
             "No such command 'rnu'",
             "check, explore, terms, compile, run, inverse, linearize, sensitivities, sweep, excite, identify, "
-            "calibrate, plot,",
+            "calibrate, optimize, plot,",
         ],
     ),
     Bad("unknown option", ["check", "five_bar", "--jsn"], ["ckc check", "--jsn", "--json", "See ckc check --help"]),

@@ -62,7 +62,7 @@ def test_file_stands_for_all_its_tables() -> None:
 def test_unknown_table_names_the_nearest(name: str, nearest: str) -> None:
     answer = ckc("keys", name)
     assert answer.code == 2
-    assert f"no table {name!r}; there are mechanism, scene, sweep, identify, calibrate, " in " ".join(
+    assert f"no table {name!r}; there are mechanism, scene, sweep, identify, calibrate, optimize, " in " ".join(
         answer.err.split()
     )
     assert f"did you mean {nearest!r}?" in " ".join(answer.err.split())

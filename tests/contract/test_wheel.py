@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PARTS = {"__init__.py", "__main__.py", "errors.py", "py.typed", "analysis", "base", "cli", "codegen", "control",
          "dynamics", "ensembles", "explorer", "formats", "identification", "kinematics", "linear",
-         "mechanism", "native", "run", "scene", "sensitivity", "urdf", "view"}  # fmt: skip
+         "mechanism", "native", "optimization", "run", "scene", "sensitivity", "urdf", "view"}  # fmt: skip
 
 
 def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Planned motions: time-optimal along a path, and optimal control from one configuration to another."""

@@ -1,0 +1,306 @@
+"""The result of `optimize`: a motion with its motor torques, its replay in the step loop, scenes and files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.base.atomic_files import write_atomic
+from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
+from ckc_pin.base.tables import to_csv_text, to_data_frame
+from ckc_pin.dynamics.terms import Terms
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.optimization.limits import MotionLimits, quantity_names
+from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
+from ckc_pin.run.columns import list_quantities
+from ckc_pin.run.simulate import simulate
+from ckc_pin.scene.scene import Scene
+
+if TYPE_CHECKING:
+    import pandas
+
+    from ckc_pin.run.run import Run
+    from ckc_pin.view.inline import Figures
+
+__all__ = ["ActiveLimit", "CoordinateMotion", "Plan", "Replay", "find_active", "measure", "replay_plan"]
+
+ACTIVE_FRACTION = 0.01  # of a limit's range: a quantity that comes closer makes the limit active
+MERGED_GAP = 0.005  # of the duration: a limit that is left for less counts as active all the time
+REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
+BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
+MAX_SAMPLES = 1_000_000
+
+
+class CoordinateMotion(Protocol):
+    """A motion of the independent coordinates."""
+
+    @property
+    def corners(self) -> Array:
+        """Times at which the accelerations may jump, with both ends, s."""
+
+    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Simulation of a plan's torques in the step loop.
+
+    Attributes
+    ----------
+    error : float
+        Largest difference of the independent coordinates and their rates at the end, SI units.
+    max_tau : float
+        Largest motor torque, N m or N.
+    closure : float
+        Largest |phi| of the plan between the points of its grid, m and rad.
+    """
+
+    error: float
+    max_tau: float
+    closure: float
+
+
+@dataclass(frozen=True)
+class ActiveLimit:
+    """A limit that a quantity reaches, from one time to another, s."""
+
+    quantity: str
+    side: str
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(HasSummary):
+    """A planned motion with its motor torques.
+
+    Attributes
+    ----------
+    mechanism : Mechanism
+    status : "solved"
+    message : str
+    t_end : float
+        Duration, s.
+    cost : float
+    parts : dict of str to float
+        Parts of the cost, without weights: time in s, effort in N² m² s, and so on.
+    iterations : int
+        Of the optimizer; sweeps of a motion along a path.
+    motion : CoordinateMotion
+        Independent coordinates over time, with rates and accelerations.
+    torque_t, torque : (k,) and (k, motors) arrays
+        Motor torques, linear between the rows.
+    t, quantities : (m,) and (m, names) arrays
+        Coordinates, rates, accelerations, shaft speeds and torques at instants.
+    margin : (m,) array
+        Smallest singular value of phi_z, relative to the start; 1 without loops.
+    limits : MotionLimits
+    active : tuple of ActiveLimit
+    replay : Replay
+    warnings : tuple of str
+    """
+
+    mechanism: Mechanism
+    status: str
+    message: str
+    t_end: float
+    cost: float
+    parts: dict[str, float]
+    iterations: int
+    motion: CoordinateMotion
+    torque_t: Array
+    torque: Array
+    t: Array
+    quantities: Array
+    margin: Array
+    limits: MotionLimits
+    active: tuple[ActiveLimit, ...]
+    replay: Replay
+    warnings: tuple[str, ...]
+
+    def columns(self) -> dict[str, Array]:
+        """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
+        named = dict(zip(quantity_names(self.mechanism), self.quantities.T, strict=True))
+        return {name: x for name, x in named.items() if not name.startswith("speed.")}
+
+    def scene(self, control: str = "open") -> Scene:
+        """Return a scene that replays the plan.
+
+        Parameters
+        ----------
+        control : "open" or "closed"
+            The plan's torques over time, or tracking control (eq. 16) of the plan's motion.
+        """
+        names = self.mechanism.independent
+        q, rates, _ = self.motion(np.zeros(1))
+        start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
+                 "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
+        return make_scene(self.mechanism, start, self.t_end, self._controller(control), control)
+
+    def _controller(self, control: str) -> dict[str, Any]:
+        if control == "open":
+            return torque_controller(self.mechanism, self.torque_t, self.torque)
+        mechanism = self.mechanism
+        at = mechanism.assembled
+        inertia = np.diag(Terms(mechanism, at, np.zeros(mechanism.n)).D)
+        bandwidth = BANDWIDTH / self.t_end
+        t = np.linspace(0.0, self.t_end, len(self.t))
+        q, _, _ = self.motion(t)
+        table = {"t": t, **dict(zip(mechanism.independent, q.T, strict=True))}
+        return {"type": "tracking", "Lambda": bandwidth, "desired": {"file": table},
+                "K_D": dict(zip(mechanism.independent, (bandwidth * inertia).tolist(), strict=True))}  # fmt: skip
+
+    def simulate(self) -> Run:
+        """Run the plan's torques in the step loop."""
+        return simulate(self.scene())
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write t and the `columns` for a controller (InputError)."""
+        write_atomic(Path(path), to_csv_text("t", self.t, self.columns()))
+        return Path(path)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the table of `to_csv` (needs the extra `data`)."""
+        return to_data_frame("t", self.t, self.columns())
+
+    def plot(self) -> Figures:
+        """Draw motion, torques with their limits, and margin. A notebook shows them; `save(folder)` writes them."""
+        import ckc_pin
+
+        return ckc_pin.plot(self)
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
+        """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError)."""
+        folder = Path(folder)
+        scenes = [self.scene(name).save(folder, name, overwrite=overwrite or name == "closed")
+                  for name in ("open", "closed")]  # fmt: skip
+        files = [*scenes, self.to_csv(folder / "plan.csv"), folder / "plan.json"]
+        write_atomic(files[-1], to_json(self.to_dict(files)) + "\n")
+        return files
+
+    def summary(self) -> Summary:
+        """Return duration, cost, replay, and the limits that the motion reaches."""
+        units = list_quantities(self.mechanism)
+        largest = [f"{name} {np.abs(self.torque[:, k]).max():.4g} {units[f'tau.{name}'].unit}"
+                   for k, name in enumerate(self.mechanism.motors.names)]  # fmt: skip
+        reached = [f"{x.quantity} {x.side}, {x.begin:.3g} to {x.end:.3g} s" for x in self.active]
+        rows: list[Row] = [
+            ("status", f"{self.status}: {self.message}"),
+            ("duration", f"{self.t_end:.6g} s"),
+            ("cost", f"{self.cost:.6g}: " + ", ".join(f"{name} {x:.4g}" for name, x in self.parts.items())),
+            ("iterations", str(self.iterations)),
+            ("largest torques", largest),
+            ("sigma_min", f"at least {self.margin.min():.3g} of the start's"),
+            ("active limits", reached or "none"),
+            ("replay", f"error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
+             f"closure of the plan {self.replay.closure:.1e}"),
+        ]  # fmt: skip
+        rows += [("warning", warning) for warning in self.warnings]
+        return Summary(f"Plan of {self.mechanism.name}", rows)
+
+    def to_dict(self, files: list[Path] | None = None) -> dict[str, Any]:
+        """Return the result as JSON-ready data.
+
+        Parameters
+        ----------
+        files : list of Path, optional
+            Written files.
+        """
+        return {
+            "name": self.mechanism.name,
+            "status": self.status,
+            "message": self.message,
+            "t_end": self.t_end,
+            "cost": self.cost,
+            "parts": self.parts,
+            "iterations": self.iterations,
+            "replay": {"error": self.replay.error, "max_tau": self.replay.max_tau, "closure": self.replay.closure},
+            "margin": float(self.margin.min()),
+            "active": [{"quantity": x.quantity, "side": x.side, "from": x.begin, "to": x.end} for x in self.active],
+            "warnings": list(self.warnings),
+            "files": [path.name for path in files or []],
+        }
+
+
+def make_scene(
+    mechanism: Mechanism, start: dict[str, dict[str, float]], t_end: float, controller: dict[str, Any], what: str
+) -> Scene:
+    """Return the scene of a plan: from its start, with a controller."""
+    return Scene(
+        mechanism, t_end=t_end, initial=start, controller=controller, name=f"{mechanism.name}, plan, {what} loop",
+        solver={"rtol": REPLAY_TOLERANCE, "atol": REPLAY_TOLERANCE, "output_dt": t_end / 200},
+    )  # fmt: skip
+
+
+def torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[str, Any]:
+    """Return the controller of recorded torques."""
+    columns = {"t": t, **dict(zip(mechanism.motors.names, torque.T, strict=True))}
+    return {"type": "torques", "file": columns, "interpolation": "linear"}
+
+
+def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, torque: Array, q_tree: Array) -> Replay:
+    """Simulate a plan's torques and compare the end with the plan's.
+
+    Parameters
+    ----------
+    dynamics : ReducedDynamics
+    motion : CoordinateMotion
+    t, torque : (k,) and (k, motors) arrays
+    q_tree : (m, nq) array
+        Closed configurations of the plan.
+    """
+    mechanism, t_end = dynamics.mechanism, float(motion.corners[-1])
+    q, rates, _ = motion(np.array([0.0, t_end]))
+    names = mechanism.independent
+    start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
+             "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
+    scene = make_scene(mechanism, start, t_end, torque_controller(mechanism, t, torque), "open")
+    run = simulate(scene)
+    at = mechanism.partition.q
+    error = max(np.abs(run.q_tree[-1, at] - q[1]).max(), np.abs(run.v_tree[-1, at] - rates[1]).max())
+    closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
+    return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
+
+
+def measure(dynamics: ReducedDynamics, at: MotionInstants) -> tuple[Array, Array]:
+    """Return the quantities of `quantity_names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
+    mechanism = dynamics.mechanism
+    numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
+    shafts = at.v_tree @ mechanism.motors.transmission.T
+    return np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau]), dynamics.margins(at.q_tree)
+
+
+def find_active(
+    limits: MotionLimits, mechanism: Mechanism, t: Array, quantities: Array, margin: Array
+) -> list[ActiveLimit]:
+    """List the limits that quantities reach, each from one time to another, in the order of these times."""
+    lower, upper = limits.bounds()
+    size = np.where(np.isfinite(upper) & np.isfinite(lower), upper - lower, np.maximum(np.abs(quantities).max(0), 1e-9))
+    reached: list[ActiveLimit] = []
+    names = quantity_names(mechanism)
+    sides = [
+        ("lower", quantities - lower <= ACTIVE_FRACTION * size / 2),
+        ("upper", upper - quantities <= ACTIVE_FRACTION * size / 2),
+    ]
+    for side, active in sides:
+        for k in np.flatnonzero(active.any(axis=0)):
+            reached += [ActiveLimit(names[k], side, *span) for span in _spans(t, active[:, k])]
+    if limits.singularity:
+        close = margin <= limits.singularity * (1 + ACTIVE_FRACTION)
+        reached += [ActiveLimit("sigma_min", "lower", *span) for span in _spans(t, close)]
+    return sorted(reached, key=lambda x: (x.begin, x.quantity))
+
+
+def _spans(t: Array, active: BoolArray) -> list[tuple[float, float]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
+    spans: list[tuple[float, float]] = []
+    for begin, end in zip(t[edges[::2]].tolist(), t[edges[1::2] - 1].tolist(), strict=True):
+        if spans and begin - spans[-1][1] < MERGED_GAP * float(t[-1]):
+            begin = spans.pop()[0]
+        spans.append((begin, end))
+    return spans

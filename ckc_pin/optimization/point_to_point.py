@@ -1,0 +1,352 @@
+"""Plan a motion from one configuration to another: ends, initial guess, optimal control, and refinement of the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.control.piecewise import PiecewisePolynomial
+from ckc_pin.dynamics.equilibrium import stable_equilibrium
+from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.kinematics.point import Point
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.mechanism.configuration import Kinematics
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
+from ckc_pin.optimization.collocation import DEGREE, Collocation, Ends, Guess, Solution, gauss_points
+from ckc_pin.optimization.limits import MotionLimits, quantity_names
+from ckc_pin.optimization.path import CoordinatePath, PathMotion
+from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
+from ckc_pin.optimization.reduced import ReducedDynamics
+from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
+
+__all__ = ["plan_between"]
+
+FIRST_INTERVALS = 40
+MAX_MESHES = 4  # each has twice the intervals of the one before
+MAX_ITERATIONS = 400  # of IPOPT on one mesh
+REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
+GUESS_PLACES = 100  # of the path of the initial guess
+VIA_ATTEMPTS = 60  # of paths through another configuration
+SAMPLES_PER_INTERVAL = 5
+SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
+EXCESS = 1e-3  # relative: a limit that is exceeded by more between the points of the mesh is reported
+
+
+@dataclass(frozen=True, eq=False)
+class EndState(Immutable):
+    """A configuration with rates of the independent coordinates."""
+
+    at: Kinematics
+    q: Array
+    rates: Array
+
+
+def plan_between(
+    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, progress: Callable[[float], None]
+) -> Plan:
+    """Plan a motion from one configuration to another.
+
+    Raises
+    ------
+    InputError
+        An end that is unknown, out of reach, or outside the limits.
+    NumericalError
+        No motion fulfils the limits, or the optimizer does not find one.
+    """
+    assert spec.to is not None
+    _refuse(mechanism, spec, limits)
+    start = _resolve(mechanism, spec.start, mechanism.assembled, "from")
+    end = _resolve(mechanism, spec.to, start.at, "to")
+    for state, name in ((start, "from"), (end, "to")):
+        _require_inside(mechanism, limits, state, name)
+    dynamics = ReducedDynamics(mechanism)
+    ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
+    motion = _guess_motion(dynamics, spec.minimize, limits, start, end)
+    mesh = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
+    torque: Callable[[Array], Array] | None = None
+    iterations = 0
+    for attempt in range(MAX_MESHES):
+        guess = _sample(dynamics, limits, motion, mesh, start, torque)
+        problem = Collocation(dynamics, limits, spec.minimize, ends, guess)
+        solution = problem.solve(iterations=MAX_ITERATIONS, warm=torque is not None)
+        iterations += solution.iterations
+        _require_solved(solution, limits)
+        plan = _assemble(dynamics, spec, limits, solution, iterations, start)
+        progress((attempt + 1) / MAX_MESHES)
+        if plan.replay.error <= REPLAY_ERROR:
+            break
+        motion, table = plan.motion, (plan.torque_t, plan.torque)
+        torque = _interpolation(*table)
+        mesh = np.sort(np.concatenate([mesh, (mesh[1:] + mesh[:-1]) / 2]))
+    return plan
+
+
+def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
+    return lambda t: np.array([np.interp(t, times, x) for x in values.T]).T.reshape(len(t), -1)
+
+
+# --- ends ----------------------------------------------------------------------------------------
+
+
+def _refuse(mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits) -> None:
+    """Refuse what a motion between configurations does not support."""
+    rubbing = [name for name, x in zip(mechanism.coordinates, mechanism.joints.friction, strict=True) if x]
+    if rubbing:
+        raise InputError(
+            f"optimize: dry friction of {', '.join(rubbing)} is supported along a path only; set it to 0, as "
+            f'parameters = {{"joint.{rubbing[0]}.friction" = 0.0}}'
+        )
+    for name in ("singularity", "keep_out"):
+        if getattr(spec.limits, name):
+            raise InputError(f"optimize: limits.{name} is supported along a path only; remove it")
+    minimize = spec.minimize
+    if not any((minimize.time, minimize.effort, minimize.jerk, minimize.peak_torque)):
+        raise InputError("optimize: minimize: every weight is zero; give one above zero, as time = 1.0")
+    if not minimize.time and not np.isfinite(limits.time):
+        raise InputError(
+            "optimize: minimize: without a weight of time the duration has no bound; give limits.time, or minimize.time"
+        )
+    if not mechanism.motors.names:
+        raise InputError(f"optimize: {mechanism.name} has no motors; add [[motor]] or actuated to the mechanism's file")
+    if (
+        minimize.time
+        and not np.isfinite(np.concatenate([limits.torque.ravel(), limits.rate, limits.acceleration])).any()
+    ):
+        raise InputError("optimize: limits: nothing limits the speed; give torque, rate or acceleration")
+
+
+def _resolve(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, name: str) -> EndState:
+    """Return the configuration that a table describes, on a branch (InputError)."""
+    where = f"optimize: {name}"
+    ways = [key for key in ("q", "point", "at") if getattr(spec, key) is not None]
+    if len(ways) != 1:
+        raise InputError(f"{where}: expected one of q, point and at, got {' and '.join(ways) or 'none'}")
+    rates = mechanism.vector(spec.q_dot, mechanism.independent, f"{where}.q_dot", fill=0.0)
+    if spec.at is not None:
+        at = mechanism.assembled if spec.at == "assembled" else stable_equilibrium(mechanism)
+        return EndState(at, mechanism.independent_part(at.q_tree), rates)
+    if spec.point is not None:
+        if len(spec.point) != 1:
+            raise InputError(f"{where}.point: expected one point, got {', '.join(spec.point) or 'none'}")
+        ((point, position),) = spec.point.items()
+        try:
+            inverse = Point(mechanism, point).inverse(position, branch)
+        except InputError as error:
+            raise InputError(f"{where}.point: unreachable: {error}") from None
+        return EndState(inverse.at, inverse.q, rates)
+    assert spec.q is not None
+    q = mechanism.vector(spec.q, mechanism.independent, f"{where}.q")
+    solution = sigma(mechanism, q, branch)
+    if solution.verdict != "converged":
+        raise InputError(f"{where}.q: unreachable: q is {solution.verdict}: {solution.reason}")
+    return EndState(solution.at, q, rates)
+
+
+def _require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
+    numbers = mechanism.tree.to_coordinates(state.at.q_tree)
+    beyond = np.maximum(limits.q[0] - numbers, numbers - limits.q[1])
+    k = int(np.argmax(beyond))
+    if beyond[k] > 1e-9:
+        raise InputError(
+            f"optimize: {name}: {mechanism.coordinates[k]} = {numbers[k]:.4g} is outside its limits "
+            f"[{limits.q[0, k]:.4g}, {limits.q[1, k]:.4g}]; change it or limits.q"
+        )
+    fast = np.abs(state.rates) > limits.rate[mechanism.partition.q]
+    if fast.any():
+        k = int(np.argmax(fast))
+        raise InputError(
+            f"optimize: {name}.q_dot: {mechanism.independent[k]} = {state.rates[k]:.4g} is above limits.rate = "
+            f"{limits.rate[mechanism.partition.q[k]]:g}"
+        )
+
+
+# --- initial guess -------------------------------------------------------------------------------
+
+
+def _guess_motion(
+    dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
+) -> CoordinateMotion:
+    """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
+    path = _find_path(dynamics, start, end)
+    at_rest = not start.rates.any() and not end.rates.any()
+    moves = np.abs(end.q - start.q).max() > 0
+    s = (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2
+    along = path_dynamics(dynamics, path, s, start.at.q_tree)
+    if at_rest and moves:
+        try:
+            profile, _ = find_fastest(dynamics, along, limits)
+            return Slowed(PathMotion(path.q, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
+        except (InputError, NumericalError):
+            pass
+    force = np.abs(along.inertia).max() * 6
+    available = np.where(np.isfinite(limits.torque), np.abs(limits.torque), 0).max(initial=0.0)
+    available = available or max(float(np.abs(along.static).max()), 1e-3 * force)
+    duration = _duration(minimize, limits, max(float(np.sqrt(force / available)), 1e-2))
+    return Slowed(SmoothMotion(path.q, start.rates, end.rates, duration), duration)
+
+
+def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> float:
+    if not minimize.time:
+        return limits.time
+    return min(fastest, limits.time)
+
+
+def _find_path(dynamics: ReducedDynamics, start: EndState, end: EndState) -> CoordinatePath:
+    """Return a path that the loops can follow: the straight line in q, or two lines through another configuration."""
+    mechanism = dynamics.mechanism
+    random = np.random.default_rng(0)
+    scale = mechanism.tree.step_scale[mechanism.partition.q]
+    middle, spread = (start.q + end.q) / 2, np.abs(end.q - start.q) / 2 + 0.5 * scale
+    assembled = mechanism.independent_part(mechanism.q_tree)
+    for attempt in range(VIA_ATTEMPTS):
+        via = [middle, assembled][attempt] if attempt < 2 else middle + spread * random.uniform(-1, 1, dynamics.d)
+        # A quadratic curve through the middle place; the straight line at first.
+        c2 = 2 * (start.q + end.q) - 4 * via
+        c1 = end.q - start.q - c2
+        q = PiecewisePolynomial(np.array([0.0, 1.0]), np.array([c2, c1, start.q])[:, None, :], end=1.0)
+        path = CoordinatePath(q)
+        reached = dynamics.follow(start.at.q_tree, q(np.linspace(0.0, 1.0, GUESS_PLACES + 1))[0])
+        if reached is not None and np.abs(reached[-1] - end.at.q_tree).max() < 1e-6:
+            return path
+    raise NumericalError(
+        f"optimize: stuck: no path of the loops from `from` to `to` was found in {VIA_ATTEMPTS} attempts; a singular "
+        "configuration may separate them. `ckc map` shows the aspects; plan in several parts"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMotion:
+    """Motion along a path with a cubic polynomial of time, plus cubics that give the rates at the ends."""
+
+    path: PiecewisePolynomial
+    start: Array
+    end: Array
+    duration: float
+
+    @property
+    def corners(self) -> Array:
+        """Both ends, s."""
+        return np.array([0.0, self.duration])
+
+    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
+        T = self.duration
+        x = t / T
+        s, s_dot, s_ddot = 3 * x**2 - 2 * x**3, (6 * x - 6 * x**2) / T, (6 - 12 * x) / T**2
+        q, q_s, q_ss = self.path(s)
+        first = np.array([x - 2 * x**2 + x**3, (1 - 4 * x + 3 * x**2) / T, (-4 + 6 * x) / T**2])
+        last = np.array([x**3 - x**2, (3 * x**2 - 2 * x) / T, (6 * x - 2) / T**2])
+        more = [T * (np.outer(a, self.start) + np.outer(b, self.end)) for a, b in zip(first, last, strict=True)]
+        return (q + more[0], q_s * s_dot[:, None] + more[1],
+                q_s * s_ddot[:, None] + q_ss * s_dot[:, None] ** 2 + more[2])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Slowed:
+    """A motion with another duration."""
+
+    motion: CoordinateMotion
+    duration: float
+
+    @property
+    def corners(self) -> Array:
+        """Both ends, s."""
+        return np.array([0.0, self.duration])
+
+    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
+        factor = float(self.motion.corners[-1]) / self.duration
+        q, v, a = self.motion(np.minimum(t * factor, self.motion.corners[-1]))
+        return q, v * factor, a * factor**2
+
+
+def _sample(
+    dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Array, start: EndState,
+    torque: Callable[[Array], Array] | None,
+) -> Guess:  # fmt: skip
+    """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics."""
+    duration = float(motion.corners[-1])
+    points = (mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel()
+    t = duration * np.sort(np.concatenate([mesh, points]))
+    is_knot = np.isin(np.arange(len(t)), np.arange(0, len(t), DEGREE + 1))
+    q, v, a = motion(t)
+    q_tree = dynamics.follow(start.at.q_tree, q)
+    if q_tree is None:
+        raise NumericalError("optimize: stuck: the loops do not close along the initial guess")
+    knots = q_tree[is_knot]
+    if torque is None:
+        at = dynamics.instants(knots, v[is_knot], a[is_knot], np.zeros((len(mesh), dynamics.motors)))
+        transmission = np.einsum("mnd,kn->mdk", dynamics.rho(knots), dynamics.mechanism.motors.transmission)
+        tau = np.clip(minimum_norm_within(transmission, at.force, limits.torque), *limits.torque)
+    else:
+        tau = torque(t[is_knot])
+    accelerations = a[~is_knot].reshape(len(mesh) - 1, DEGREE, -1)
+    return Guess(mesh, duration, q[is_knot], v[is_knot], accelerations, tau, q_tree[~is_knot])
+
+
+# --- result --------------------------------------------------------------------------------------
+
+
+def _require_solved(solution: Solution, limits: MotionLimits) -> None:
+    if solution.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+        return
+    label, size = solution.violation
+    if solution.status == "Infeasible_Problem_Detected":
+        raise NumericalError(
+            f"optimize: infeasible: no motion near the initial guess fulfils all limits; the largest violation, of "
+            f"{label}, is {size:.3g}; raise torque, time or the other limits"
+        )
+    if solution.status == "Maximum_Iterations_Exceeded":
+        raise NumericalError(
+            f"optimize: budget: no optimum after {solution.iterations} iterations; the largest violation, of {label}, "
+            f"is {size:.3g}"
+        )
+    raise NumericalError(
+        f"optimize: stuck: IPOPT reports {solution.status} after {solution.iterations} iterations; the largest "
+        f"violation, of {label}, is {size:.3g}; give other intervals or another start"
+    )
+
+
+def _assemble(
+    dynamics: ReducedDynamics,
+    spec: OptimizeSpec,
+    limits: MotionLimits,
+    solution: Solution,
+    iterations: int,
+    start: EndState,
+) -> Plan:
+    mechanism, values = dynamics.mechanism, solution.values
+    motion = solution.motion()
+    torque = np.clip(values.torque, *limits.torque)
+    knots = motion.corners
+    parts = np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
+    t = np.append((knots[:-1, None] + np.diff(knots)[:, None] * parts).ravel(), knots[-1])
+    q, v, a = motion(t)
+    q_tree = dynamics.follow(start.at.q_tree, q)
+    if q_tree is None:
+        raise NumericalError(
+            "optimize: stuck: the loops do not close between the points of the mesh; give more intervals"
+        )
+    at = dynamics.instants(q_tree, v, a, _interpolation(knots, torque)(t))
+    quantities, margin = measure(dynamics, at)
+    warnings = list(_excess_warnings(limits, mechanism, quantities))
+    replay = replay_plan(dynamics, motion, knots, torque, q_tree)
+    if replay.error > REPLAY_ERROR:
+        warnings.append(f"the replay misses the end by {replay.error:.1e}; give more intervals")
+    return Plan(
+        mechanism=mechanism, status="solved", message="a local optimum", t_end=values.duration, cost=solution.cost,
+        parts=solution.parts, iterations=iterations, motion=motion, torque_t=knots, torque=torque, t=t,
+        quantities=quantities, margin=margin, limits=limits,
+        active=tuple(find_active(limits, mechanism, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
+    )  # fmt: skip
+
+
+def _excess_warnings(limits: MotionLimits, mechanism: Mechanism, quantities: Array) -> list[str]:
+    excess = limits.excess(quantities).max(axis=0) / np.maximum(np.abs(quantities).max(axis=0), 1e-12)
+    names = quantity_names(mechanism)
+    return [f"{names[k]} exceeds its limit by {excess[k]:.1%} between the points of the mesh; give more intervals"
+            for k in np.flatnonzero(excess > EXCESS)]  # fmt: skip

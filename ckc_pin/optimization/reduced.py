@@ -1,0 +1,364 @@
+"""Eq. 6 at many instants of a motion of the independent coordinates, with exact first and second derivatives.
+
+The dependent coordinates, their rates and accelerations, and the multipliers are functions of q, q_dot, q_ddot and the
+motor torques. They are eliminated instant by instant: the loops are closed to rounding at each instant, and derivatives
+follow from the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.codegen.arguments import present, values
+from ckc_pin.codegen.expressions import term_expressions
+from ckc_pin.errors import InputError
+from ckc_pin.mechanism.mechanism import Mechanism
+from ckc_pin.mechanism.parameter_map import model_numbers
+
+__all__ = ["Derivatives", "MotionInstants", "ReducedDynamics", "evaluate_many"]
+
+MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism: of q between two closures
+MAX_FOLLOWED_STEP = 0.2  # rad, or sizes of the mechanism: from a configuration to those that are closed from it
+MAX_NEWTON_STEPS = 12
+MAX_NEWTON_STEP = 1.0  # rad, or sizes of the mechanism
+MAX_PIECES = 64  # of a step of q
+BLOCKS = (8, 128)  # instants that are evaluated in one call
+
+
+@dataclass(frozen=True, eq=False)
+class MotionInstants(Immutable):
+    """A motion at m instants.
+
+    Attributes
+    ----------
+    q_tree : (m, nq) array
+    v_tree, a_tree : (m, n) array
+    multipliers : (m, rows) array
+        Of the independent constraint rows.
+    tau : (m, motors) array
+        N m, N.
+    force : (m, d) array
+        D q_ddot + C q_dot + h less the motors' rho^T u': zero along a motion.
+    """
+
+    q_tree: Array
+    v_tree: Array
+    a_tree: Array
+    multipliers: Array
+    tau: Array
+    force: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives(Immutable):
+    """Derivatives of `MotionInstants` by x = (q, q_dot, q_ddot, tau), each of shape (m, ..., 3 d + motors)."""
+
+    q_tree: Array
+    v_tree: Array
+    a_tree: Array
+    multipliers: Array
+    force: Array
+    blocks: tuple[Array, ...] = ()  # derivatives of rows and forces of the tree
+
+
+class ReducedDynamics:
+    """The reduced equations of motion of a mechanism at many instants.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+
+    Raises
+    ------
+    InputError
+        CasADi is not installed, or a free root is independent.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        try:
+            import casadi as cs
+        except ModuleNotFoundError as error:
+            raise InputError("optimize needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
+        tree = mechanism.tree
+        of_root = [name for name in mechanism.independent if name in tree.free_coordinates]
+        if of_root:
+            raise InputError(f"optimize: {of_root[0]} belongs to a free root; choose independent coordinates of joints")
+        self.mechanism, self.d, self.n = mechanism, mechanism.d, mechanism.n
+        self.motors = len(mechanism.motors.names)
+        self.q_at, self.z_at = mechanism.partition.q, mechanism.partition.z
+        self.q_in_tree = tree.q_index[self.q_at]
+        self.z_in_tree = np.setdiff1d(np.arange(tree.nq), self.q_in_tree)
+        terms, numbers = term_expressions(mechanism), model_numbers(mechanism)
+        parameters = cs.DM(values(numbers, present(numbers)))
+        q, v, a = terms.configuration.q, terms.v, terms.v_dot
+        kept = list(terms.kept)
+        norms = [(cs.sumsqr(q[start : start + 4]) - 1) / 2 for start in terms.quaternions]
+        multipliers, tau = cs.SX.sym("multipliers", len(kept)), cs.SX.sym("tau", self.motors)
+        transmission = cs.sparsify(cs.DM(mechanism.motors.transmission))
+
+        def substitute(x: Any) -> Any:
+            return cs.substitute(terms.configuration.as_function_of_q(x), terms.arguments.vector, parameters)
+
+        J = substitute(terms.rows.J)[kept, :]
+        phi = cs.vertcat(substitute(terms.rows.phi)[kept], *norms)
+        J_dot_v = substitute(terms.rows.J_dot_v)[kept]
+        acceleration = cs.mtimes(J, a) + J_dot_v
+        passive = substitute(terms.inverse_dynamics - terms.damping)
+        balance = passive - cs.mtimes(transmission.T, tau) - cs.mtimes(J.T, multipliers)
+        self._symbols = q, v, a, multipliers
+        self._rows = phi, cs.mtimes(J, v), acceleration, balance
+        self._closure = _function([q], [phi, cs.jacobian(phi, q)])
+        self._rates = _function([q, v], [J, J_dot_v])
+        self._passive = _function([q, v, a], [passive])
+
+    @cached_property
+    def _first(self) -> Any:
+        """First derivatives of rows, their rates and accelerations, and of the forces' balance."""
+        import casadi as cs
+
+        (q, v, a, _), (phi, rate, acceleration, balance) = self._symbols, self._rows
+        by = ((phi, q), (rate, v), (rate, q), (acceleration, q), (acceleration, v), (balance, q), (balance, v),
+              (balance, a))  # fmt: skip
+        return _function(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
+
+    @cached_property
+    def _second(self) -> Any:
+        """Second derivatives of a weighted sum of the same."""
+        import casadi as cs
+
+        q, v, a, multipliers = self._symbols
+        weights = [cs.SX.sym(f"w_{k}", x.numel()) for k, x in enumerate(self._rows)]
+        lagrangian = sum(cs.dot(w, x) for w, x in zip(weights, self._rows, strict=True))
+        by_q, by_v = cs.gradient(lagrangian, q), cs.gradient(lagrangian, v)
+        pairs = ((by_q, q), (by_q, v), (by_v, v), (by_q, a), (by_q, multipliers))
+        return _function([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
+
+    # --- values ----------------------------------------------------------------------------------
+
+    def close(self, q_tree: Array, q: Array) -> Array | None:
+        """Return closed configurations (m, nq) at q (m, d), followed from closed ones; None if the loops do not close.
+
+        det phi_z keeps its sign.
+        """
+        scale = self.mechanism.tree.step_scale[self.q_at]
+        start = q_tree[:, self.q_in_tree]
+        far = np.max(np.abs(q - start) / scale, initial=0.0)
+        if not far < MAX_PIECES * MAX_CONTINUATION_STEP:
+            return None
+        count = 1 + int(far / MAX_CONTINUATION_STEP)
+        _, jacobian = evaluate_many(self._closure, q_tree)
+        signs = np.sign(np.linalg.det(jacobian[:, :, self.z_in_tree]))
+        for k in range(1, count + 1):
+            target = start + (q - start) * (k / count)
+            predicted = self._newton_step(jacobian, jacobian[:, :, self.q_in_tree], target - q_tree[:, self.q_in_tree])
+            q_tree = np.array(q_tree)
+            q_tree[:, self.q_in_tree] = target
+            q_tree[:, self.z_in_tree] += predicted
+            result = self._newton(q_tree)
+            if result is None:
+                return None
+            q_tree, jacobian = result
+            if np.any(np.sign(np.linalg.det(jacobian[:, :, self.z_in_tree])) != signs):
+                return None
+        return q_tree
+
+    def follow(self, start: Array, q: Array) -> Array | None:
+        """Return closed configurations at q (m, d), each followed from the one before, from a start (nq,) on.
+
+        None if the loops do not close.
+        """
+        scale = float(self.mechanism.tree.step_scale[self.q_at].min(initial=1.0))
+        at, result, begin = start[None], np.empty((len(q), len(start))), 0
+        while begin < len(q):
+            # Places near the last configuration are closed together.
+            reachable = np.abs(q[begin:] - at[0, self.q_in_tree]).max(axis=1, initial=0.0) <= MAX_FOLLOWED_STEP * scale
+            end = begin + max(1, len(reachable) if reachable.all() else int(np.argmin(reachable)))
+            closed = self.close(np.tile(at, (end - begin, 1)), q[begin:end])
+            while closed is None and end > begin + 1:
+                end = begin + (end - begin) // 2
+                closed = self.close(np.tile(at, (end - begin, 1)), q[begin:end])
+            if closed is None:
+                return None
+            result[begin:end] = closed
+            at, begin = closed[-1:], end
+        return result
+
+    def residual(self, q_tree: Array) -> Array:
+        """Return phi of the independent rows and of quaternions' norms at configurations (m, nq), (m, rows)."""
+        return evaluate_many(self._closure, q_tree)[0][:, :, 0]
+
+    def _newton(self, q_tree: Array) -> tuple[Array, Array] | None:
+        for _ in range(MAX_NEWTON_STEPS):
+            phi, jacobian = evaluate_many(self._closure, q_tree)
+            size = np.abs(phi).max(initial=0.0)
+            if not np.isfinite(size):
+                return None
+            if size <= self.mechanism.tolerance:
+                return q_tree, jacobian
+            step = self._newton_step(jacobian, phi, np.ones((len(phi), 1)))
+            if not np.abs(step).max(initial=0.0) <= MAX_NEWTON_STEP * max(1.0, self.mechanism.size):
+                return None
+            q_tree[:, self.z_in_tree] += step
+        return None
+
+    def _newton_step(self, jacobian: Array, columns: Array, weights: Array) -> Array:
+        """Return -phi_z^-1 (columns @ weights), (m, nz)."""
+        right = np.einsum("mrd,md->mr", columns, weights)
+        if not right.shape[1]:
+            return right
+        try:
+            return -np.linalg.solve(jacobian[:, :, self.z_in_tree], right[:, :, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            return np.full_like(right, np.nan)
+
+    def rho(self, q_tree: Array) -> Array:
+        """Return rho of eq. 5 at closed configurations, (m, n, d)."""
+        J, _ = evaluate_many(self._rates, q_tree, np.zeros((len(q_tree), self.n)))
+        return self._rho(J, _inverse(J[:, :, self.z_at]))
+
+    def _rho(self, J: Array, inverse: Array) -> Array:
+        rho = np.zeros((len(J), self.n, self.d))
+        rho[:, self.q_at, np.arange(self.d)] = 1.0
+        rho[:, self.z_at] = -inverse @ J[:, :, self.q_at]
+        return rho
+
+    def margins(self, q_tree: Array) -> Array:
+        """Return smallest singular values of phi_z at configurations, relative to the first; 1 without loops."""
+        if not len(self.z_at):
+            return np.ones(len(q_tree))
+        J, _ = evaluate_many(self._rates, q_tree, np.zeros((len(q_tree), self.n)))
+        smallest = np.linalg.svd(J[:, :, self.z_at], compute_uv=False)[:, -1]
+        return smallest / smallest[0]
+
+    def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
+        """Return a motion at closed configurations with rates and accelerations (m, d) and torques (m, motors)."""
+        v_tree, a_tree = np.zeros((2, len(q_tree), self.n))
+        J, _ = evaluate_many(self._rates, q_tree, v_tree)
+        inverse = _inverse(J[:, :, self.z_at])
+        v_tree[:, self.q_at], a_tree[:, self.q_at] = v, a
+        v_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], v))
+        _, J_dot_v = evaluate_many(self._rates, q_tree, v_tree)
+        a_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], a) + J_dot_v[:, :, 0])
+        (passive,) = evaluate_many(self._passive, q_tree, v_tree, a_tree)
+        force = passive[:, :, 0] - tau @ self.mechanism.motors.transmission
+        multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
+        missing = force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
+        return MotionInstants(q_tree, v_tree, a_tree, multipliers, tau, missing)
+
+    # --- derivatives -----------------------------------------------------------------------------
+
+    def differentiate(self, at: MotionInstants) -> Derivatives:
+        """Return the derivatives of a motion's quantities by q, q_dot, q_ddot and tau of each instant."""
+        m, d, n, q_at, z_at = len(at.q_tree), self.d, self.n, self.q_at, self.z_at
+        blocks = evaluate_many(self._first, at.q_tree, at.v_tree, at.a_tree, at.multipliers)
+        phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = blocks
+        size = 3 * d + self.motors
+        inverse, J_q = _inverse(J[:, :, z_at]), J[:, :, q_at]
+        q_tree = np.zeros((m, self.mechanism.tree.nq, size))
+        v_tree, a_tree = np.zeros((2, m, n, size))
+        unit = np.arange(d)
+        q_tree[:, self.q_in_tree, unit] = 1.0
+        q_tree[:, self.z_in_tree, :d] = -_inverse(phi_q[:, :, self.z_in_tree]) @ phi_q[:, :, self.q_in_tree]
+        v_tree[:, q_at, d + unit] = 1.0
+        v_tree[:, z_at] = -inverse @ (rate_q @ q_tree + J_q @ v_tree[:, q_at])
+        a_tree[:, q_at, 2 * d + unit] = 1.0
+        a_tree[:, z_at] = -inverse @ (acc_q @ q_tree + acc_v @ v_tree + J_q @ a_tree[:, q_at])
+        balance = balance_q @ q_tree + balance_v @ v_tree + balance_a @ a_tree
+        balance[:, :, 3 * d :] -= self.mechanism.motors.transmission.T
+        multipliers = inverse.transpose(0, 2, 1) @ balance[:, z_at]
+        force = balance[:, q_at] - J_q.transpose(0, 2, 1) @ multipliers
+        return Derivatives(q_tree, v_tree, a_tree, multipliers, force, tuple(blocks))
+
+    def hessian(
+        self, at: MotionInstants, by_x: Derivatives, weights: Array, q_weights: Array | None = None,
+        v_weights: Array | None = None,
+    ) -> Array:  # fmt: skip
+        """Return the second derivatives of weights (m, d) times the missing force, (m, 3 d + motors, 3 d + motors).
+
+        Parameters
+        ----------
+        q_weights : (m, nq) array, optional
+            The result includes the second derivatives of these weights times the configuration.
+        v_weights : (m, n) array, optional
+            The same of the rates v'.
+        """
+        z_at = self.z_at
+        phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = by_x.blocks
+        inverse = _inverse(J[:, :, z_at])
+        w_balance = _times(self._rho(J, inverse), weights)
+        to_rows = inverse.transpose(0, 2, 1)
+        w_acceleration = -_times(to_rows, _transposed(balance_a, w_balance)[:, z_at])
+        by_v = _transposed(balance_v, w_balance) + _transposed(acc_v, w_acceleration)
+        w_rate = -_times(to_rows, (by_v if v_weights is None else by_v + v_weights)[:, z_at])
+        by_q = _transposed(balance_q, w_balance) + _transposed(acc_q, w_acceleration) + _transposed(rate_q, w_rate)
+        by_q = by_q if q_weights is None else by_q + q_weights
+        inverse_q = _inverse(phi_q[:, :, self.z_in_tree])
+        w_phi = -_times(inverse_q.transpose(0, 2, 1), by_q[:, self.z_in_tree])
+        qq, qv, vv, qa, ql = evaluate_many(
+            self._second, at.q_tree, at.v_tree, at.a_tree, at.multipliers, w_phi, w_rate, w_acceleration, w_balance
+        )
+        mixed = qq @ by_x.q_tree / 2 + qv @ by_x.v_tree + qa @ by_x.a_tree + ql @ by_x.multipliers
+        half = by_x.q_tree.transpose(0, 2, 1) @ mixed + by_x.v_tree.transpose(0, 2, 1) @ (vv @ by_x.v_tree) / 2
+        return half + half.transpose(0, 2, 1)
+
+
+def evaluate_many(function: Any, *columns: Array) -> list[Array]:
+    """Evaluate a CasADi function with dense outputs at many instants.
+
+    Parameters
+    ----------
+    function : casadi.Function
+    columns : (m, k) arrays
+        A row for each instant.
+
+    Returns
+    -------
+    list of (m, rows, columns) arrays
+    """
+    count = len(columns[0])
+    size = next((size for size in BLOCKS if size >= count), BLOCKS[-1])
+    padded = -(-count // size) * size
+    inputs = [np.ascontiguousarray(np.concatenate([x, np.repeat(x[-1:], padded - count, axis=0)])) for x in columns]
+    outputs = [np.empty((padded, function.size2_out(k), function.size1_out(k))) for k in range(function.n_out())]
+    buffer, evaluate = _block(function, size)
+    for begin in range(0, padded, size):
+        for k, x in enumerate(inputs):
+            buffer.set_arg(k, x[begin : begin + size].data)
+        for k, y in enumerate(outputs):
+            buffer.set_res(k, y[begin : begin + size].data)
+        evaluate()
+    return [y[:count].transpose(0, 2, 1) for y in outputs]
+
+
+@cache
+def _block(function: Any, size: int) -> tuple[Any, Any]:
+    """Return the buffer of a function that evaluates `size` instants, and how to call it."""
+    buffer, evaluate = function.map(size).buffer()
+    return buffer, evaluate
+
+
+def _function(inputs: list[Any], outputs: list[Any]) -> Any:
+    import casadi as cs
+
+    return cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True})
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.einsum("mij,mj->mi", matrices, vectors)
+
+
+def _transposed(matrices: Array, vectors: Array) -> Array:
+    return np.einsum("mij,mi->mj", matrices, vectors)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Return the inverses of matrices, NaN if one of them is singular."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=float)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrices, np.nan)
