@@ -159,8 +159,8 @@ def _announce_compilation(seconds: float) -> None:
     "table",
     metavar="[TABLE]",
     required=False,
-    help="A table, as motor, solver, controller.desired or tracking; or all tables of a file: mechanism, scene, sweep, identify, "
-    "calibrate, optimize.",
+    help="A table, as motor, solver, controller.desired or tracking; or all tables of a file: mechanism, scene, sweep, "
+    "identify, calibrate, optimize.",
 )
 @options.as_json
 def keys(table: str | None, as_json: bool) -> None:
