@@ -39,7 +39,7 @@ def write() -> None:
 
 
 def _keys() -> Iterator[str]:
-    yield "Keys of mechanism, scene, sweep, identification, calibration and optimization files, as `ckc keys` prints them."
+    yield "Keys of all files that a user writes, as `ckc keys` prints them."
     yield ""
     yield from format_tables([(file, table) for file in FILES for table in tables(file)])
 
