@@ -34,7 +34,6 @@ Core::Core(CoreTable table)
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n),
       J_dot_v.setZero(m);
   C_tree_.setZero(n, n), damping_tree.setZero(n);
-  if (compiled) D_compiled_.setZero(n, n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   unbalanced_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
   tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
@@ -183,9 +182,10 @@ void Core::compute_rho() {
 void Core::compute_D_tree() {
   if (is_valid(inertia_of_tree)) return;
   Profile::Entry entry(profile, Profile::D_tree);
-  if (compiled)
+  if (compiled) {
+    if (!D_compiled_.size()) D_compiled_.setZero(n, n);
     compiled->evaluate_D_tree(q_tree, D_compiled_);
-  else
+  } else
     tree.compute_D(q_tree);
   valid_parts_ |= inertia_of_tree;
 }

@@ -187,9 +187,10 @@ class Core {
   void allow_elimination(bool allowed);
   bool eliminate(In u_tree, In correction, Out acceleration);
   bool elimination_step(In residual, Out x);  // as `closure_step`
-  // Relative rounding errors of the acceleration at the core's state: of elimination compared with projection, and of projection compared with projection by mass levels. Zero
-  // if the reference does not exist.
-  double rounding_of_elimination(In u_tree);
+  // Relative rounding errors of the acceleration at the core's state: of elimination compared with projection, and of
+  // projection compared with projection by mass levels. Zero if the reference does not exist. Above `limit`, the
+  // rounding of the reference is subtracted.
+  double rounding_of_elimination(In u_tree, double limit);
   double rounding_of_projection(In u_tree);
   // Whether masses differ so much that projection may lose digits. With `use_mass_levels`, projection by mass levels
   // is used (core_levels.cpp).

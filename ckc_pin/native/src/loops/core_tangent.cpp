@@ -20,6 +20,8 @@ constexpr double min_partition_pivot = 1e-2, max_partition_slope = 4.0, max_new_
 // Coordinates above which the basis of a check keeps the partition if it is well conditioned: the time of pivoting grows
 // as n^3.
 constexpr int max_pivoted_size = 300;
+// Accepted rounding error of elimination, relative to that of projection.
+constexpr double max_rounding_ratio = 10.0;
 // Rounding error of an acceleration, relative to the forces that cause it.
 constexpr double acceleration_rounding_factor = 1e-13;
 
@@ -288,14 +290,21 @@ double Core::relative_difference(In a, In reference) {
   return difference > 0.0 ? difference / largest : 0.0;
 }
 
-double Core::rounding_of_elimination(In u_tree) {
+double Core::rounding_of_elimination(In u_tree, double limit) {
   Vector by_elimination(n), reference(n);
   residual_.setZero();
   const bool exists = compiled ? compiled->eliminate(q_tree, v_tree, u_tree, residual_, by_elimination)
                                : eliminate(u_tree, residual_, by_elimination);
   if (!exists || !find_basis_for_check()) return 0.0;
   project_on_tangent_space(u_tree, reference);
-  if (!uses_mass_levels_) return relative_difference(by_elimination, reference);
+  if (!uses_mass_levels_) {
+    const double difference = relative_difference(by_elimination, reference);
+    if (difference <= limit || !constraints.closure.rows || !find_basis_by_partition()) return difference;
+    // Two projections by different bases differ by the rounding of the reference.
+    Vector by_partition(n);
+    project_on_tangent_space(u_tree, by_partition);
+    return std::max(0.0, difference - max_rounding_ratio * relative_difference(by_partition, reference));
+  }
   Vector by_levels(n);
   const Vector forces = y_;
   if (project_by_mass_levels(u_tree, by_levels)) reference = by_levels;

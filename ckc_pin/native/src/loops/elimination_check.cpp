@@ -73,7 +73,7 @@ void EliminationCheck::check(Core& core) {
     Vector q_tree = q_tree_, v = v_;
     if (!redundant || project_onto_manifold(core, q_tree, v)) {
       core.set_velocity(v);
-      is_accurate = core.rounding_of_elimination(u_tree_) <= limit;
+      is_accurate = core.rounding_of_elimination(u_tree_, limit) <= limit;
     }
     if (redundant) core.set_configuration(q_tree_), core.set_velocity(v_);
     core.allow_elimination(is_accurate);

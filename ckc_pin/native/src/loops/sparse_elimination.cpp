@@ -6,8 +6,9 @@
 
 namespace ckc {
 
-// Pivot, relative to the sum that it is left of: elimination loses four digits there, as in `ckc_pin.codegen`.
-constexpr double min_pivot_ratio = 1e-4;
+// Pivot, relative to the sum that it is left of. The joints near the root of a long chain have small ones: D' contains the
+// inertia of the whole chain there. Whether digits are lost that projection keeps is up to EliminationCheck.
+constexpr double min_pivot_ratio = 1e-6;
 
 SparseElimination::SparseElimination(const std::vector<Indices>& inertia_pattern,
                                      const std::vector<Indices>& row_pattern, Indices kept)
