@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -32,7 +33,7 @@ class Closed:
             TreeText(world.urdf(prefix), f"{prefix}.urdf", prefix, "free" if free else "fixed", xyz=xyz, rpy=rpy)
             for (prefix, (xyz, rpy)), free in zip(world.stands.items(), (False, world.free), strict=True)
         ]
-        self.tree = Tree(pin.buildModelFromXML(merge(texts)[0]))
+        self.tree = Tree(pin.buildModelFromXML(ElementTree.tostring(merge(texts).root, encoding="unicode")))
         builder = ClosureBuilder(self.tree, Frames(self.tree.model))
         for spec in specs:
             builder.add_loop(spec) if isinstance(spec, LoopSpec) else builder.add_coupling(spec)
