@@ -164,7 +164,7 @@ def _announce_compilation(seconds: float) -> None:
 )
 @options.as_json
 def keys(table: str | None, as_json: bool) -> None:
-    """Print the keys of mechanism, scene, sweep, identification, calibration and optimization files.
+    """Print the keys of all files that a user writes.
 
     A line for each key says its type, its unit, its default and its meaning.
     """

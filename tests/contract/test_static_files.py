@@ -24,6 +24,7 @@ PAGES = {
     "explorer": (EXPLORE / "explore.html", EXPLORE / "explore.css",
                  [SHARED, *(path for path in SCRIPTS if path.parent == EXPLORE)]),
 }  # fmt: skip
+REPORT = VIEW / "report.html"  # with its style inside, and without scripts
 VOID_ELEMENTS = {"meta", "link", "input"}
 MAX_LINE_LENGTH = 120
 UNSAFE = re.compile(r"\b(eval|innerHTML|outerHTML|insertAdjacentHTML|document\.write|new Function)\b")
@@ -63,7 +64,14 @@ def check_elements(page: Path) -> ElementChecker:
 
 def test_all_static_files_are_checked() -> None:
     belonging = {path for page, style, scripts in PAGES.values() for path in (page, style, *scripts)}
-    assert belonging == set(FILES)
+    assert belonging | {REPORT} == set(FILES)
+
+
+def test_report_closes_its_elements_and_runs_no_scripts() -> None:
+    assert not check_elements(REPORT).errors
+    text = REPORT.read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    assert "<script" not in text
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
