@@ -101,6 +101,16 @@ class StandIn:
         ]
         self.server.send(commands.group_commands([*transforms, pose.to_command()]))
 
+    def take_through(self, last: messages.Request) -> list[messages.Request]:
+        """Wait for a request, and return and forget it with those before it. It must be the last one."""
+        deadline = time.monotonic() + PATIENCE
+        while last not in self.requests:
+            assert time.monotonic() < deadline, self.requests
+            time.sleep(0.01)
+        taken = self.take(len(self.requests))
+        assert taken[-1] == last, taken
+        return taken
+
     def take(self, count: int) -> list[messages.Request]:
         """Wait for requests, and return and forget them. There must not be more of them."""
         deadline = time.monotonic() + PATIENCE
