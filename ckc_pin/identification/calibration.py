@@ -15,10 +15,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.identification.calibration_fit import Fit, Readings
 from ckc_pin.identification.calibration_geometry import Geometry
 from ckc_pin.identification.calibration_result import Calibration, make_calibration
-from ckc_pin.identification.identify import load_start
 from ckc_pin.identification.records import read_csv
 from ckc_pin.identification.spec import UNITS, read_calibrate
-from ckc_pin.kinematics.loading import as_mechanism
+from ckc_pin.kinematics.loading import as_mechanism, load_beside
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES, parts_of, split_component, split_name, values_of, with_components
 
@@ -120,9 +119,10 @@ def calibrate_file(path: str | Path, overrides: Mapping[str, Any] | None = None)
             f"{suggest_name(missing, columns)}"
         )
     poses = {name: UNITS[spec.units.get(name, "rad")] * np.array(column) for name, column in columns.items()}
+    mechanism = load_beside(spec.mechanism, folder, spec.parameters)
     return calibrate(
-        load_start(spec, folder), poses, estimate.parameters, noise=estimate.noise, prior=estimate.prior,
-        tracker=estimate.tracker, loss=estimate.loss,
+        mechanism, poses, estimate.parameters, noise=estimate.noise, prior=estimate.prior, tracker=estimate.tracker,
+        loss=estimate.loss,
     )  # fmt: skip
 
 

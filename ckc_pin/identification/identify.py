@@ -11,13 +11,12 @@ from ckc_pin.errors import InputError
 from ckc_pin.identification.motions import identify_motion
 from ckc_pin.identification.records import Record, read_record
 from ckc_pin.identification.result import Identification
-from ckc_pin.identification.spec import CalibrateSpec, IdentifySpec, read_identify
+from ckc_pin.identification.spec import IdentifySpec, read_identify
 from ckc_pin.identification.torques import identify_torques
-from ckc_pin.kinematics.loading import as_mechanism, load
-from ckc_pin.mechanism.library import is_path
+from ckc_pin.kinematics.loading import as_mechanism, load_beside
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["identify", "identify_file", "load_start", "load_task"]
+__all__ = ["identify", "identify_file", "load_task"]
 
 METHODS = ("torques", "motion")
 
@@ -94,16 +93,9 @@ def identify_file(path: str | Path, overrides: Mapping[str, Any] | None = None) 
     )  # fmt: skip
 
 
-def load_start(spec: IdentifySpec | CalibrateSpec, folder: Path) -> Mechanism:
-    """Load the mechanism that a file names, with the values of its table of parameters (InputError)."""
-    name = folder / spec.mechanism if is_path(spec.mechanism) else spec.mechanism
-    overrides = {key: tuple(x) if isinstance(x, list) else x for key, x in spec.parameters.items()}
-    return load(name, overrides or None)  # type: ignore[arg-type]
-
-
 def load_task(spec: IdentifySpec, folder: Path) -> tuple[Mechanism, list[Record]]:
     """Load the mechanism and the records that a file names (InputError)."""
-    mechanism = load_start(spec, folder)
+    mechanism = load_beside(spec.mechanism, folder, spec.parameters)
     return mechanism, [read_record(entry.file, mechanism, entry, folder) for entry in spec.data]
 
 

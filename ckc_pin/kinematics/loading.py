@@ -15,12 +15,12 @@ from ckc_pin.base.toml import convert, join_dotted_keys, read_toml
 from ckc_pin.base.validation import is_number, require_table, require_type
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.assembly import assemble_mechanism
-from ckc_pin.mechanism.library import MECHANISM_FILE, GeneratorSpec, read_mechanism_texts
+from ckc_pin.mechanism.library import MECHANISM_FILE, GeneratorSpec, is_path, read_mechanism_texts
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameters import Overrides
+from ckc_pin.mechanism.parameters import Overrides, plain_values
 from ckc_pin.mechanism.spec import MechanismSpec
 
-__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "check_overrides", "load", "read_spec"]
+__all__ = ["MechanismCache", "as_mechanism", "build", "cache", "check_overrides", "load", "load_beside", "read_spec"]
 
 
 class MechanismCache:
@@ -96,6 +96,20 @@ def load(
     require_type(name, (str, Path, GeneratorSpec), "load: name", "a mechanism's shipped name or its path")
     checked = None if overrides is None else check_overrides(overrides, "load: overrides")
     return build(*read_mechanism_texts(name), checked, prescribed)
+
+
+def load_beside(name: str, folder: Path, parameters: Mapping[str, float | list[float]]) -> Mechanism:
+    """Load the mechanism that a file names: a shipped name, or a path relative to the file's folder; errors as `load`.
+
+    Parameters
+    ----------
+    name : str
+    folder : Path
+        Folder of the file.
+    parameters : mapping
+        The file's table of parameter values.
+    """
+    return load(folder / name if is_path(name) else name, plain_values(parameters) or None)
 
 
 def check_overrides(overrides: Any, where: str) -> Overrides:

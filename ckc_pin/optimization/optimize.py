@@ -13,8 +13,7 @@ from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.dynamics.inverse import friction_force
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.loading import as_mechanism, load
-from ckc_pin.mechanism.library import is_path
+from ckc_pin.kinematics.loading import as_mechanism, load_beside
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import (
     PathDynamics,
@@ -99,9 +98,7 @@ def optimize(
 def optimize_file(path: str | Path, progress: Callable[[float], None] | None = None) -> Plan:
     """Plan the motion that a file describes; errors as of `optimize`."""
     spec, _ = read_optimize(path)
-    name = Path(path).parent / spec.mechanism if is_path(spec.mechanism) else spec.mechanism
-    overrides = {key: tuple(x) if isinstance(x, list) else x for key, x in spec.parameters.items()}
-    mechanism = load(name, overrides or None)  # type: ignore[arg-type]
+    mechanism = load_beside(spec.mechanism, Path(path).parent, spec.parameters)
     return _optimize(mechanism, spec, progress or (lambda fraction: None))
 
 
