@@ -158,7 +158,7 @@ def _refine_profile(
     suspect: BoolArray | None = None  # intervals to check; all of them before the end
     for round_ in range(MAX_REFINEMENTS):
         along = path_dynamics(dynamics, path, s)
-        _require_within(limits, dynamics.mechanism, along, dynamics)
+        _require_within(limits, along, dynamics)
         profile, sweeps = find_fastest(dynamics, along, narrowed)
         motion, total = PathMotion(path.q, profile), total + sweeps
         exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect)
@@ -259,9 +259,9 @@ def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec) -> None:
             raise InputError(f"optimize: limits.{name}: not supported along a path; remove it")
 
 
-def _require_within(limits: MotionLimits, mechanism: Mechanism, along: PathDynamics, dynamics: ReducedDynamics) -> None:
+def _require_within(limits: MotionLimits, along: PathDynamics, dynamics: ReducedDynamics) -> None:
     """Refuse a path that leaves the limits of coordinates, or comes too close to a singularity."""
-    s = along.s
+    mechanism, s = dynamics.mechanism, along.s
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in along.q_tree])
     beyond = np.maximum(limits.q[0] - numbers, numbers - limits.q[1])
     k = int(np.argmax(beyond.max(axis=0)))

@@ -136,15 +136,11 @@ class Plan(HasSummary):
         control : "open" or "closed"
             The plan's torques over time, or tracking control (eq. 16) of the plan's motion.
         """
-        names = self.mechanism.independent
-        q, rates, _ = self.motion(np.zeros(1))
-        start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
-                 "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
-        return make_scene(self.mechanism, start, self.t_end, self._controller(control), control)
+        return _make_scene(self.mechanism, self.motion, self._controller(control), control)
 
     def _controller(self, control: str) -> dict[str, Any]:
         if control == "open":
-            return torque_controller(self.mechanism, self.torque_t, self.torque)
+            return _torque_controller(self.mechanism, self.torque_t, self.torque)
         mechanism = self.mechanism
         at = mechanism.assembled
         inertia = np.diag(Terms(mechanism, at, np.zeros(mechanism.n)).D)
@@ -227,17 +223,19 @@ class Plan(HasSummary):
         }
 
 
-def make_scene(
-    mechanism: Mechanism, start: dict[str, dict[str, float]], t_end: float, controller: dict[str, Any], what: str
-) -> Scene:
+def _make_scene(mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str) -> Scene:
     """Return the scene of a plan: from its start, with a controller."""
+    names, t_end = mechanism.independent, float(motion.corners[-1])
+    q, rates, _ = motion(np.zeros(1))
+    start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
+             "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
     return Scene(
         mechanism, t_end=t_end, initial=start, controller=controller, name=f"{mechanism.name}, plan, {what} loop",
         solver={"rtol": REPLAY_TOLERANCE, "atol": REPLAY_TOLERANCE, "output_dt": t_end / 200},
     )  # fmt: skip
 
 
-def torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[str, Any]:
+def _torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[str, Any]:
     """Return the controller of recorded torques."""
     columns = {"t": t, **dict(zip(mechanism.motors.names, torque.T, strict=True))}
     return {"type": "torques", "file": columns, "interpolation": "linear"}
@@ -254,15 +252,11 @@ def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, t
     q_tree : (m, nq) array
         Closed configurations of the plan.
     """
-    mechanism, t_end = dynamics.mechanism, float(motion.corners[-1])
-    q, rates, _ = motion(np.array([0.0, t_end]))
-    names = mechanism.independent
-    start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
-             "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
-    scene = make_scene(mechanism, start, t_end, torque_controller(mechanism, t, torque), "open")
-    run = simulate(scene)
+    mechanism = dynamics.mechanism
+    run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque), "open"))
+    q, rates, _ = motion(motion.corners[-1:])
     at = mechanism.partition.q
-    error = max(np.abs(run.q_tree[-1, at] - q[1]).max(), np.abs(run.v_tree[-1, at] - rates[1]).max())
+    error = max(np.abs(run.q_tree[-1, at] - q[0]).max(), np.abs(run.v_tree[-1, at] - rates[0]).max())
     closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
     return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
 

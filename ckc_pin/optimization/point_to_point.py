@@ -93,7 +93,7 @@ def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
 
 
 def _refuse(mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits) -> None:
-    """Refuse what a motion between configurations does not support."""
+    """Refuse keys of the file that a motion between configurations does not support."""
     rubbing = [name for name, x in zip(mechanism.coordinates, mechanism.joints.friction, strict=True) if x]
     if rubbing:
         raise InputError(
