@@ -7,6 +7,7 @@
 
 #include "loops/core.hpp"
 #include "loops/compiled_terms.hpp"
+#include "loops/partition.hpp"
 #include "loops/sparse_elimination.hpp"
 
 namespace ckc {
@@ -17,9 +18,6 @@ constexpr double rank_lost_pivot = 1e-12, min_pivot_for_inertia_metric = 1e-3;
 // The tangent basis keeps its partition while the pivot ratio is larger and its entries are smaller than these. A new
 // partition has to satisfy the stricter last bound.
 constexpr double min_partition_pivot = 1e-2, max_partition_slope = 4.0, max_new_partition_slope = 3.0;
-// Coordinates above which the basis of a check keeps the partition if it is well conditioned: the time of pivoting grows
-// as n^3.
-constexpr int max_pivoted_size = 300;
 // Accepted rounding error of elimination, relative to that of projection.
 constexpr double max_rounding_ratio = 10.0;
 // Rounding error of an acceleration, relative to the forces that cause it.
@@ -43,6 +41,7 @@ bool Core::find_basis_by_partition() {
     basis_configuration_ = configuration_count;
   }
   basis_.solve(minus_residual_, z_);
+  x_.setZero();
   for (size_t i = 0; i < basis_z_.size(); ++i) x_(basis_z_[i]) = z_(i);
   return true;
 }
@@ -82,7 +81,7 @@ bool Core::find_basis_by_pivoting(double min_pivot) {
     householder_rhs_(k) -= projection;
     householder_rhs_.tail(v.size()) -= projection * v;
   }
-  tangent_.setZero();
+  tangent_.setZero(), x_.setZero();
   for (int i = rank - 1; i >= 0; --i) {  // back substitution: -R^-1 of the right-hand side and of S
     double value = householder_rhs_(i);
     for (int k = i + 1; k < rank; ++k) value -= r(i, k) * x_(order(k));
@@ -102,10 +101,9 @@ bool Core::find_basis_by_pivoting(double min_pivot) {
 
 bool Core::find_tangent_basis(In residual, double min_pivot) {
   compute_J();
-  x_.setZero();
   minus_residual_ = -residual;  // residual may be residual_ itself
   if (!constraints.closure.rows)
-    tangent_.setIdentity();
+    tangent_.setIdentity(), x_.setZero();
   else if (!find_basis_by_partition()) {
     if (!find_basis_by_pivoting(min_pivot)) return false;
     take_pivots_as_partition();
@@ -265,11 +263,11 @@ void Core::project_on_tangent_space(In u_tree, Out a) {
 
 bool Core::find_basis_for_check() {
   compute_J(), compute_bias();
-  minus_residual_ = -J_dot_v, x_.setZero();
+  minus_residual_ = -J_dot_v;
   if (n > max_pivoted_size && find_basis_by_partition()) return true;
   basis_configuration_ = -1;  // compute the partition's basis again when it is needed
   if (constraints.closure.rows) return find_basis_by_pivoting(rank_lost_pivot);
-  tangent_.setIdentity();
+  tangent_.setIdentity(), x_.setZero();
   std::iota(basis_coordinates_.begin(), basis_coordinates_.end(), 0);
   return true;
 }

@@ -6,8 +6,7 @@
 
 namespace ckc {
 
-constexpr int max_pivoted_size = 300;  // coordinates above which J is not decomposed: the time of that grows as n^3
-constexpr double min_exchange_factor = 1.5;
+constexpr double min_exchange_factor = 1.5;  // of |det phi_z|
 
 namespace {
 

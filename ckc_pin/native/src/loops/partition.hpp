@@ -1,9 +1,12 @@
-// Choice of the partition q' = [q; z] by a pivoted factorization.
+// Choice of the partition q' = [q; z] by a pivoted factorization, or by exchanges of coordinates.
 #pragma once
 
 #include "loops/core.hpp"
 
 namespace ckc {
+
+// Coordinates above which J is not pivoted while a partition is well conditioned: the time of pivoting grows as n^3.
+constexpr int max_pivoted_size = 300;
 
 struct Partition {
   Indices q, z;

@@ -37,7 +37,7 @@ static std::vector<RecordColumns> columns_of(const System& system) {
 }
 
 Recorder::Recorder(const System& system) : columns(columns_of(system)), width(columns.back().end) {
-  momentum_.setZero(system.core.n);
+  momentum_.setZero(system.core.n), phi_dot_.setZero(system.core.constraints.closure.rows);
 }
 
 void Recorder::start(Vector instants, double* rows, Eigen::Index max_rows) {
@@ -73,11 +73,12 @@ bool Recorder::fill_row(System& system, double t, In y, Out row) {
   row(at++) = core.joints.dissipated_energy(row.segment(1, n));
   row(at++) = system.control.lyapunov(system.measured(t), energy.potential, core.constraints.phi);
   double max_phi_error = 0.0, max_phi_dot_error = 0.0;
+  core.constraints.multiply_J(system.velocity, phi_dot_);
   for (int i = 0; i < m; ++i) {
     max_phi_error = std::max(max_phi_error, std::abs(core.constraints.phi(i) - system.w(i)));
-    double rate = -system.w_decay_rate() * system.w(i) - (core.has_row_motion() ? core.row_motion.rate(i) : 0.0);
-    for (int j : core.constraints.pattern[i]) rate += core.constraints.J(i, j) * system.velocity(j);
-    max_phi_dot_error = std::max(max_phi_dot_error, std::abs(rate));
+    max_phi_dot_error =
+        std::max(max_phi_dot_error, std::abs(phi_dot_(i) - system.w_decay_rate() * system.w(i) -
+                                             (core.has_row_motion() ? core.row_motion.rate(i) : 0.0)));
   }
   row(at++) = max_phi_error, row(at++) = max_phi_dot_error;
   if (system.forces()) append(system.forces()->wrenches);

@@ -35,7 +35,7 @@ class Recorder {
  private:
   bool fill_row(System& system, double t, In y, Out row);
 
-  Vector instants_, momentum_;
+  Vector instants_, momentum_, phi_dot_;
   double* rows_ = nullptr;
   Eigen::Index max_rows_ = 0, next_ = 0;
 };
