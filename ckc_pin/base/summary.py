@@ -77,7 +77,8 @@ class Summary:
             f'<td style="text-align: left">{escape(GAP.join(items))}</td></tr>'
             for label, items in ((label, [x] if isinstance(x, str) else x) for label, x in self.rows)
         )
-        return f"<div><strong>{escape(self.title)}</strong><table>{rows}</table></div>"
+        title = f"<strong>{escape(self.title)}</strong>" if self.title else ""
+        return f"<div>{title}<table>{rows}</table></div>"
 
 
 class HasSummary:

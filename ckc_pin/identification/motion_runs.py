@@ -42,7 +42,7 @@ RTOL = 1e-10  # of runs
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion(Immutable):
-    """One record, and what its runs need.
+    """One record with the inputs of its runs.
 
     Attributes
     ----------

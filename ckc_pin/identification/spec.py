@@ -95,7 +95,7 @@ class EstimateSpec(FileStruct, frozen=True, kw_only=True):
 
 
 class IdentifySpec(FileStruct, frozen=True, kw_only=True):
-    """An identification: a mechanism, recorded motions, and what is estimated from them.
+    """An identification: a mechanism, recorded motions, and the parameters that are estimated from them.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ class CalibrateEstimateSpec(FileStruct, frozen=True, kw_only=True):
 
 
 class CalibrateSpec(FileStruct, frozen=True, kw_only=True):
-    """A calibration: a mechanism, readings of many poses, and what is estimated from them.
+    """A calibration: a mechanism, readings of many poses, and the parameters that are estimated from them.
 
     Attributes
     ----------

@@ -88,7 +88,7 @@ class MotionAdvice:
         self._q_tree, self._has_torques = q_tree[at], has_torques
 
     def explain(self, gradient: Array, determined: Array) -> str:
-        """Return what is missing to know a parameter.
+        """Return why a parameter has no value, and which motion would determine it.
 
         Parameters
         ----------
@@ -105,14 +105,14 @@ class MotionAdvice:
         return self._suggest(gradient - determined @ (determined.T @ gradient))
 
     def explain_rest(self, determined: Array) -> list[str]:
-        """Return what would tell each combination that some motion determines, but the data do not."""
+        """Return which motion would determine each combination that some motion determines, but the data do not."""
         outside = self.directions - determined @ (determined.T @ self.directions)
         u, _, _ = np.linalg.svd(outside, full_matrices=False)
         count = max(self.directions.shape[1] - determined.shape[1], 0)
         return [self._suggest(direction) for direction in u[:, :count].T]
 
     def _suggest(self, missing: Array) -> str:
-        """Return what would tell a direction of the unknowns that some motion determines."""
+        """Return which motion would determine a direction of the unknowns."""
         missing = missing / max(float(np.linalg.norm(missing)), 1e-300)
         start = (self.regressor.start / self.regressor.scale)[self.order]
         if not self._has_torques and abs(missing @ start) > 0.5 * np.linalg.norm(start):
@@ -126,7 +126,7 @@ class MotionAdvice:
 
     @cached_property
     def _experiments(self) -> list[tuple[str, Array]]:
-        """Motions of one coordinate, and what they add to the regressor (equations, p) at rest."""
+        """Motions of one coordinate, with the equations (equations, p) that they add to the regressor at rest."""
         mechanism, count, rng = self.regressor.mechanism, len(self._q_tree), np.random.default_rng(0)
         tree, at, rate = mechanism.tree, mechanism.partition.q, (GRAVITY / mechanism.size) ** 0.5
         q = np.array([tree.to_coordinates(one)[at] for one in self._q_tree])

@@ -52,11 +52,7 @@ def _overview(result: Identification) -> str:
     rows = [(label, content) for label, content in result.summary().rows if label in shown]
     physical = "all inertias are those of bodies that can exist" if result.physical else "some inertias are impossible"
     about = [("records", ", ".join(sources)), ("method", f"{result.method}, {result.instants} instants"), *rows]
-    return _strip_title(Summary("", [*about, ("inertias", physical)]))
-
-
-def _strip_title(summary: Summary) -> str:
-    return summary.html().replace("<strong></strong>", "")
+    return Summary("", [*about, ("inertias", physical)]).html()
 
 
 def _parameters(result: Identification) -> str:

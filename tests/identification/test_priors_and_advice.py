@@ -1,4 +1,4 @@
-"""Priors of parameters, and what is said of parameters without a value."""
+"""Priors of parameters, and the advice for parameters without a value."""
 
 from __future__ import annotations
 
