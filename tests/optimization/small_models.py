@@ -1,14 +1,19 @@
-"""Mechanisms whose optimal motions have closed forms."""
+"""Mechanisms whose optimal motions have closed forms, and the check of a plan's replay."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from ckc_pin import Mechanism
+import numpy as np
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from ckc_pin import Mechanism, Plan
 
 MASS = 2.0  # kg, of the slider and of the pendulum
 LENGTH = 0.4  # m, of the pendulum
 GRAVITY = 9.81
+REPLAY, CLOSURE = 1e-6, 1e-10  # of replays: rad, rad/s, m, m/s; largest |phi| of plans
 
 
 def slider(*, damping: float = 0.0, friction: float = 0.0, **motor: Any) -> Mechanism:
@@ -44,3 +49,28 @@ def pendulum(**motor: Any) -> Mechanism:
       <joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 0 1"/></joint>
     </robot>"""
     return Mechanism.from_urdf(urdf, gravity=[0, -GRAVITY, 0], motors=[{"joint": "hinge", **motor}])
+
+
+def pendulum_duration(angle: float, torque: float) -> float:
+    """Return the smallest time in which the pendulum turns from rest to rest, s.
+
+    The torque is M up to an angle and -M after it, which follows from the energy at both ends.
+    """
+    inertia, weight = MASS * LENGTH**2 + 1e-9, MASS * GRAVITY * LENGTH
+
+    def square(q: float, switch: float) -> float:
+        work = torque * q if q < switch else torque * (2 * switch - q)
+        return float(2 * (work - weight * (1 - np.cos(q))) / inertia)
+
+    switch = brentq(lambda c: square(angle, c), angle / 2, angle)
+    # Substitutions x = q^(1/2) at the start and (angle - q)^(1/2) at the end remove the singularities.
+    first = quad(lambda x: 2 * x / np.sqrt(square(x**2, switch)), 0, np.sqrt(switch), epsabs=1e-12)[0]
+    second = quad(lambda x: 2 * x / np.sqrt(square(angle - x**2, switch)), 0, np.sqrt(angle - switch), epsabs=1e-12)[0]
+    return float(first + second)
+
+
+def require_replay(plan: Plan, limit: float) -> None:
+    """Require that a replay ends where the plan does, that its loops are closed, and its torques within the limit."""
+    assert plan.replay.error < REPLAY
+    assert plan.replay.closure < CLOSURE
+    assert plan.replay.max_tau <= limit * (1 + 1e-9)

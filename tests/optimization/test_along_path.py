@@ -10,25 +10,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from scipy.optimize import brentq
 
 import ckc_pin
 from ckc_pin import InputError, NumericalError, Plan, optimize
 from tests.contract.helpers.command import ckc
-from tests.optimization.small_models import GRAVITY, LENGTH, MASS, pendulum, slider
+from tests.optimization.small_models import (
+    MASS,
+    REPLAY,
+    pendulum,
+    pendulum_duration,
+    require_replay,
+    slider,
+)
 
-REPLAY = 1e-6  # rad, rad/s, m, m/s
-CLOSURE = 1e-10
 FIVE_BAR = {"q": {"theta_1": [-1.434, -1.2, -1.0], "theta_3": [-1.707, -1.6, -1.9]}}
 PICK = {"point": {"plate": [[0.0, 0.0, -0.29], [0.0, 0.0, -0.27], [0.1, 0.0, -0.27], [0.1, 0.0, -0.29]]},
         "shape": "lines", "rounding": 0.01}  # fmt: skip
-
-
-def require_replay(plan: Plan, limit: float) -> None:
-    assert plan.replay.error < REPLAY
-    assert plan.replay.closure < CLOSURE
-    assert plan.replay.max_tau <= limit * (1 + 1e-9)
 
 
 @cache
@@ -44,20 +42,10 @@ def test_double_integrator_is_bang_bang() -> None:
 
 
 def test_pendulum_is_bang_bang() -> None:
-    """The torque is M up to an angle and -M after it, which follows from the energy at both ends."""
+    """One switch of the torque. The duration is an integral over the angle."""
     angle, torque = 1.0, 9.0
-    inertia, weight = MASS * LENGTH**2 + 1e-9, MASS * GRAVITY * LENGTH
-
-    def square(q: float, switch: float) -> float:
-        work = torque * q if q < switch else torque * (2 * switch - q)
-        return 2 * (work - weight * (1 - np.cos(q))) / inertia
-
-    switch = brentq(lambda c: square(angle, c), angle / 2, angle)
-    # Substitutions x = q^(1/2) at the start and (angle - q)^(1/2) at the end remove the singularities.
-    first = quad(lambda x: 2 * x / np.sqrt(square(x**2, switch)), 0, np.sqrt(switch), epsabs=1e-12)[0]
-    second = quad(lambda x: 2 * x / np.sqrt(square(angle - x**2, switch)), 0, np.sqrt(angle - switch), epsabs=1e-12)[0]
     plan = optimize(pendulum(torque_limit=torque), path={"q": {"hinge": [0.0, angle]}})
-    assert plan.t_end == pytest.approx(first + second, rel=3e-5)
+    assert plan.t_end == pytest.approx(pendulum_duration(angle, torque), rel=3e-5)
     require_replay(plan, torque)
 
 
