@@ -1,5 +1,8 @@
 """C source of CasADi functions: straight-line code in which identical branches are computed as vectors.
 
+A function can also be written for several members of an ensemble at a time: the same operations on vectors that hold
+one number of each member.
+
 A result that is NaN marks an unused place of the result: no value of its own is written there.
 """
 
@@ -12,13 +15,17 @@ from typing import Any
 
 from ckc_pin.codegen.graph import Graph, Lane, Packing
 
-__all__ = ["LaneMap", "count_operations", "count_statements", "split_column", "trace_result_lanes", "write_c_source"]
+__all__ = [
+    "MEMBERS", "LaneMap", "count_operations", "count_statements", "split_column", "trace_result_lanes",
+    "write_c_source",
+]  # fmt: skip
 
 LaneMap = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: the lane, and the shared number
 
 # Functions in which several quotients share one division. The others keep one division each: with another last digit of
 # the acceleration, stiff runs take other steps.
 SHARED_DIVISIONS = ("state",)
+MEMBERS = 8  # of an ensemble, computed together; their numbers fill one cache line
 HEAD = """#include <math.h>
 typedef double two __attribute__((vector_size(16)));
 typedef double four __attribute__((vector_size(32)));
@@ -28,6 +35,14 @@ typedef long long int two_bits __attribute__((vector_size(16)));
 typedef long long int four_bits __attribute__((vector_size(32)));
 static const two two_ones={1.,1.};
 static const four four_ones={1.,1.,1.,1.};
+"""
+# The whole library is not compiled for AVX-512, with which code on single numbers becomes slower.
+HEAD_OF_MEMBERS = """typedef double members __attribute__((vector_size(64)));
+typedef long long int members_bits __attribute__((vector_size(64)));
+static const members members_ones={1.,1.,1.,1.,1.,1.,1.,1.};
+#ifdef HAS_AVX512F
+__attribute__((target("avx512f")))
+#endif
 """
 
 
@@ -49,9 +64,21 @@ def _operation_formats() -> tuple[dict[int, str], dict[int, str]]:
     return both | scalar, {**both, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}
 
 
-def write_c_source(functions: Sequence[Any], lanes: LaneMap) -> str:
-    """Return the C source of CasADi functions. Callers must pass all arguments and ask for all results."""
-    return HEAD + "".join(_FunctionWriter(function, lanes).write() for function in functions)
+def write_c_source(functions: Sequence[Any], lanes: LaneMap, of_members: Sequence[Any] = ()) -> str:
+    """Return the C source of CasADi functions. Callers must pass all arguments and ask for all results.
+
+    Parameters
+    ----------
+    functions : sequence of casadi.Function
+    lanes : mapping
+        Lanes of arguments that belong to identical branches.
+    of_members : sequence of casadi.Function
+        Functions that are also written for `MEMBERS` members at a time, as NAME_of_members. The members' values of one
+        number stand one after the other, from an address that is a multiple of 64.
+    """
+    texts = [_FunctionWriter(function, lanes).write() for function in functions]
+    texts += [HEAD_OF_MEMBERS + _MembersWriter(function, {}).write() for function in of_members]
+    return HEAD + "".join(texts)
 
 
 def trace_result_lanes(function: Any, result: str, lanes: LaneMap) -> dict[int, tuple[Lane, int]]:
@@ -95,6 +122,8 @@ class _FunctionWriter:
     Scalars are called a1, a2 ..., packs p1, p2 ..., vectors gathered from scalars g1, g2 ...
     """
 
+    number, suffix, columns = "double", "", 1  # type of a number, suffix of the name, values of each number
+
     def __init__(self, function: Any, lanes: LaneMap) -> None:
         import casadi as cs
 
@@ -115,16 +144,19 @@ class _FunctionWriter:
     def write(self) -> str:
         """Return the function, and the functions that tell the sizes of its arguments and results."""
         f = self.function
-        name = f.name()
-        self.lines += [f"const double *restrict x{k}=arg[{k}];" for k in range(f.n_in())]
-        self.lines += [f"double *restrict y{k}=res[{k}];" for k in range(f.n_out())]
+        name, number = f.name() + self.suffix, self.number
+        self.lines += [f"const {number} *restrict x{k}=(const {number}*)arg[{k}];" for k in range(f.n_in())]
+        self.lines += [f"{number} *restrict y{k}=({number}*)res[{k}];" for k in range(f.n_out())]
         self._write_results()
         head = f"int {name}(const double** arg, double** res, long long int* iw, double* w, int mem) {{"
         sizes = [
-            *_size_functions(f"{name}_%s_in", [f.size_in(k) for k in range(f.n_in())]),
-            *_size_functions(f"{name}_%s_out", [f.size_out(k) for k in range(f.n_out())]),
+            *_size_functions(f"{name}_%s_in", [self._size(f.size_in(k)) for k in range(f.n_in())]),
+            *_size_functions(f"{name}_%s_out", [self._size(f.size_out(k)) for k in range(f.n_out())]),
         ]
         return "\n".join([head, *self.lines, "return 0;", "}", *sizes, ""])
+
+    def _size(self, shape: tuple[int, int]) -> tuple[int, int]:
+        return shape if self.columns == 1 else (self.columns, shape[0] * shape[1])
 
     def _write_results(self) -> None:
         """Write the operations of each result as late as possible, which keeps few numbers alive."""
@@ -148,8 +180,7 @@ class _FunctionWriter:
         if node.operation not in (self.constant, self.input):
             operands = [self.graph.nodes[k].operands for k in nodes]
             if nodes[0] not in self.pack:
-                text = self.scalar_formats[node.operation]
-                self._declare("double", f"a{nodes[0]}={text.format(*map(self._scalar, operands[0]))}")
+                self._declare(self.number, f"a{nodes[0]}={self._operation(node.operation, operands[0])}")
             else:
                 text = self.vector_formats[node.operation]
                 vectors = [self._vector(x) for x in zip(*operands, strict=True)]
@@ -160,7 +191,11 @@ class _FunctionWriter:
             self.lines.append(f"*({_vector_type(nodes)}_at*)(y{result}+{start})=p{self.pack[nodes[0]][0]};")
             return
         for k in nodes:
-            self.lines += [f"y{result}[{entry}]={self._scalar(k)};" for result, entry in self.stored.get(k, ())]
+            self.lines += [f"y{result}[{entry}]={self._number(k)};" for result, entry in self.stored.get(k, ())]
+
+    def _operation(self, operation: int, operands: Sequence[int]) -> str:
+        """Return an operation on numbers."""
+        return self.scalar_formats[operation].format(*map(self._scalar, operands))
 
     def _declare(self, kind: str, definition: str) -> None:
         """Write a variable's definition, in one declaration with the last line's if that has the same type."""
@@ -178,6 +213,9 @@ class _FunctionWriter:
         if node.operation == self.input:
             return f"x{node.source[0]}[{node.source[1]}]"
         return "p{}[{}]".format(*self.pack[k]) if k in self.pack else f"a{k}"
+
+    def _number(self, k: int) -> str:
+        return self._scalar(k)
 
     def _vector(self, nodes: tuple[int, ...]) -> str:
         """Return an operand of a vector operation, from its nodes in all lanes."""
@@ -220,6 +258,25 @@ class _FunctionWriter:
             return None
         end = start + len(nodes) + len(nodes) % 2
         return (argument, start) if end <= self.function.numel_in(argument) else None
+
+
+class _MembersWriter(_FunctionWriter):
+    """Writes one function's C source for several members at a time: a number is a vector with an entry of each."""
+
+    number, suffix, columns = "members", "_of_members", MEMBERS
+
+    def _operation(self, operation: int, operands: Sequence[int]) -> str:
+        if operation in self.vector_formats:
+            return self.vector_formats[operation].format(*map(self._number, operands), self.number)
+        entries = (
+            self.scalar_formats[operation].format(*(f"{self._number(x)}[{member}]" for x in operands))
+            for member in range(MEMBERS)
+        )
+        return f"{{{','.join(entries)}}}"
+
+    def _number(self, k: int) -> str:
+        is_constant = self.graph.nodes[k].operation == self.constant
+        return f"({self._scalar(k)}-(members){{0.}})" if is_constant else self._scalar(k)
 
 
 def _vector_type(nodes: Sequence[int]) -> str:

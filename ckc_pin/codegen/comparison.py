@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.c_source import MEMBERS
 from ckc_pin.codegen.derivatives import DIRECTIONS
 from ckc_pin.codegen.elimination import elimination_order, saddle_point_matrix, smallest_pivot_ratio
 from ckc_pin.codegen.library import Library
@@ -65,6 +66,22 @@ class CompiledFunctions:
         getattr(self._library, name)(self._pointers(inputs), self._pointers(results), None, None, 0)
         return results
 
+    def accelerations(self, q: Array, v: Array, u: Array, numbers: Array) -> Array:
+        """Return `acceleration` of several members at a time, without correction; one column per member everywhere."""
+        name = "acceleration_of_members"
+        inputs = (
+            q,
+            np.vstack([np.cos(q), np.sin(q)]),
+            v,
+            u,
+            np.zeros((self.size(name, "in", 4) // MEMBERS, MEMBERS)),
+            numbers,
+        )
+        results = [np.zeros((self.size(name, "out", k) // MEMBERS, MEMBERS)) for k in range(2)]
+        arguments, results = ([_aligned(x) for x in arrays] for arrays in (inputs, results))
+        getattr(self._library, name)(self._pointers(arguments), self._pointers(results), None, None, 0)
+        return results[0]
+
     def size(self, name: str, side: str, k: int) -> int:
         """Return the number of entries of a function's k-th argument (`side` = "in") or result ("out")."""
         sizes = getattr(self._library, f"{name}_sparsity_{side}")
@@ -73,6 +90,15 @@ class CompiledFunctions:
 
     def _pointers(self, arrays: list[Array]) -> ctypes.Array[ctypes._Pointer[ctypes.c_double]]:
         return (self._pointer * len(arrays))(*(x.ctypes.data_as(self._pointer) for x in arrays))
+
+
+def _aligned(x: Array) -> Array:
+    """Return a copy whose address is a multiple of 64."""
+    memory = np.empty(x.size + 8)
+    start = -memory.ctypes.data % 64 // memory.itemsize
+    copy = memory[start : start + x.size].reshape(x.shape)
+    copy[...] = x
+    return copy
 
 
 def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
@@ -93,6 +119,8 @@ def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
         _compare_terms(terms, functions, random.uniform(-1, 1, mechanism.n))
         if mechanism.redundant and not is_closed:
             continue  # redundant rows contradict each other there
+        if "acceleration_of_members" in functions:
+            _compare_members(terms, functions, library.parameters, random)
         is_comparable = _compare_solutions(terms, functions, order, *random.uniform(-1, 1, (2, mechanism.n)))
         if is_comparable and "change" in functions:
             _compare_directional_derivatives(terms, functions, library.parameters, random)
@@ -218,6 +246,23 @@ def _compare_derivatives(mechanism: Mechanism, functions: CompiledFunctions, q: 
             )
             difference = (forward - backward) / (2 * h)
             _require_equal(mechanism, f"the acceleration by {name}", ours, difference, size, DERIVATIVES_TOLERANCE)
+
+
+def _compare_members(
+    terms: Terms, functions: CompiledFunctions, parameters: Array, random: np.random.Generator
+) -> None:
+    """Compare the accelerations of members, at neighbouring states and with other numbers, with one at a time."""
+    mechanism, no_correction = terms.mechanism, np.zeros(terms.mechanism.closure.rows)
+    q, v, u = (
+        x[:, None] + random.uniform(-STATE_SPREAD, STATE_SPREAD, (len(x), MEMBERS))
+        for x in (terms.q_tree, terms.v_tree, np.zeros(mechanism.n))
+    )
+    numbers = np.array([functions.numbers_of(parameters * random.uniform(0.9, 1.1)) for _ in range(MEMBERS)]).T
+    together = functions.accelerations(q, v, u, numbers)
+    for k in range(MEMBERS):
+        alone = functions.call("acceleration", q[:, k], v[:, k], u[:, k], no_correction, numbers=numbers[:, k])[0]
+        if not np.array_equal(together[:, k], alone, equal_nan=True):
+            raise InputError(f"{mechanism.name}: compiled accelerations of several members have other digits than one")
 
 
 def _compare_directional_derivatives(

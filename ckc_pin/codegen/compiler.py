@@ -69,7 +69,8 @@ def _machine_flags(fuses: bool) -> tuple[str, ...]:
         features = set(Path("/proc/cpuinfo").read_text(encoding="ascii").split())
     except OSError:
         return ()
-    return tuple(f"-m{x}" for x in ("avx2", "fma") if x in features and (fuses or x != "fma"))
+    flags = [f"-m{x}" for x in ("avx2", "fma") if x in features and (fuses or x != "fma")]
+    return (*flags, *(["-DHAS_AVX512F"] if "avx512f" in features else []))
 
 
 def hash_of(value: object) -> str:

@@ -71,16 +71,20 @@ def explain_too_large(mechanism: Mechanism) -> str:
 
 
 def find_compiled_terms(
-    mechanism: Mechanism, which: Mapping[str, BoolArray] | None = None, *, directional_derivatives: bool = False
+    mechanism: Mechanism,
+    which: Mapping[str, BoolArray] | None = None,
+    *,
+    directional_derivatives: bool = False,
+    of_members: bool = False,
 ) -> Library | None:
     """Return a mechanism's compiled terms if the cache has them and the file is intact; otherwise None.
 
-    `which` and `directional_derivatives` as in `compile_terms`.
+    The arguments are those of `compile_terms`.
     """
     folder = cache_folder()
     if explain_too_large(mechanism) or not folder.is_dir():
         return None
-    return _look_up(_Subject.of(mechanism, which, directional_derivatives), folder)
+    return _look_up(_Subject.of(mechanism, which, directional_derivatives, of_members), folder)
 
 
 def compile_terms(
@@ -89,6 +93,7 @@ def compile_terms(
     on_written: Callable[[float], None] | None = None,
     *,
     directional_derivatives: bool = False,
+    of_members: bool = False,
     limited: bool = True,
 ) -> Library:
     """Return a mechanism's compiled terms: from the cache, compiled earlier in this process, or compiled now.
@@ -103,6 +108,8 @@ def compile_terms(
         Called once before the compiler starts, with the seconds that it may take.
     directional_derivatives : bool
         Whether to add directional derivatives of the acceleration, which takes longer to compile.
+    of_members : bool
+        Whether to add the acceleration of several members of an ensemble at a time, which takes longer too.
     limited : bool
         Whether to refuse a tree that is too large. The compiler's only other limit is its timeout.
 
@@ -114,7 +121,7 @@ def compile_terms(
     """
     if limited and (reason := explain_too_large(mechanism)):
         raise InputError(reason)
-    subject = _Subject.of(mechanism, which, directional_derivatives)
+    subject = _Subject.of(mechanism, which, directional_derivatives, of_members)
     is_used = _process_folder.cache_info().currsize > 0  # by terms that the cache could not take
     for folder in (cache_folder(), *([_process_folder()] if is_used else [])):
         if (library := _look_up(subject, folder)) is not None:
@@ -133,17 +140,20 @@ class _Subject:
     parameters: Array
     which: Mapping[str, BoolArray]
     directional_derivatives: bool
+    of_members: bool
 
     @classmethod
-    def of(cls, mechanism: Mechanism, which: Mapping[str, BoolArray] | None, directional_derivatives: bool) -> _Subject:
+    def of(
+        cls,
+        mechanism: Mechanism,
+        which: Mapping[str, BoolArray] | None,
+        directional_derivatives: bool,
+        of_members: bool,
+    ) -> _Subject:
         mechanism_numbers = model_numbers(mechanism)
         which = which or present(mechanism_numbers)
-        return cls(
-            _key(mechanism, which, directional_derivatives),
-            values(mechanism_numbers, which),
-            which,
-            directional_derivatives,
-        )
+        key = _key(mechanism, which, directional_derivatives, of_members)
+        return cls(key, values(mechanism_numbers, which), which, directional_derivatives, of_members)
 
 
 def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism:
@@ -161,11 +171,12 @@ def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism
     is_covered = all(
         np.all(subject.which[name] | ~there) for name, there in present(model_numbers(unchanged)).items()
     )  # a number that an override sets to zero is no argument
-    same = is_covered and _key(unchanged, subject.which, subject.directional_derivatives) == subject.key
+    added = subject.directional_derivatives, subject.of_members
+    same = is_covered and _key(unchanged, subject.which, *added) == subject.key
     return unchanged if same else mechanism
 
 
-def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_derivatives: bool) -> str:
+def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_derivatives: bool, of_members: bool) -> str:
     """Return the hash of everything that enters the code: this package, the tree, the rows, which numbers are zero."""
     tree, closure = mechanism.tree, mechanism.closure
     model = tree.model
@@ -193,7 +204,7 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_deriv
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
     arguments = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
-    kind = (mechanism.redundant, directional_derivatives, platform.machine())
+    kind = (mechanism.redundant, directional_derivatives, of_members, platform.machine())
     return hash_of((_package_hash(), joints, groups, table, arguments, springs, *kind))[:32]
 
 
@@ -270,7 +281,10 @@ def _write_c_source(mechanism: Mechanism, subject: _Subject) -> str:
         from ckc_pin.codegen.term_functions import TermFunctions
 
         return TermFunctions.of(
-            mechanism, subject.which, directional_derivatives=subject.directional_derivatives
+            mechanism,
+            subject.which,
+            directional_derivatives=subject.directional_derivatives,
+            of_members=subject.of_members,
         ).c_source()
     except ModuleNotFoundError as error:
         message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"

@@ -43,6 +43,8 @@ class TermFunctions:
     - `FUNCTIONS` are the terms. `coriolis` is left out of a tree with a free root, whose twist has several C'.
       `jacobian` is left out where it would take too long to compile.
 
+    With `of_members`, the acceleration is also written for several members of an ensemble at a time.
+
     With `directional_derivatives`, there are also directional derivatives of the acceleration:
 
     - `state` of (q, trig, v, u, numbers) gives what does not depend on the direction, the acceleration, and whether it
@@ -59,10 +61,12 @@ class TermFunctions:
     functions : dict of str to casadi.Function
     lanes : mapping
         Lanes of the arguments that belong to identical branches.
+    of_members : bool
     """
 
     functions: dict[str, Any]
     lanes: LaneMap
+    of_members: bool = False
 
     @classmethod
     def of(
@@ -71,6 +75,7 @@ class TermFunctions:
         which: Mapping[str, BoolArray] | None = None,
         *,
         directional_derivatives: bool = False,
+        of_members: bool = False,
     ) -> TermFunctions:
         """Derive a mechanism's functions.
 
@@ -81,6 +86,8 @@ class TermFunctions:
             Numbers that are arguments (`arguments.present`).
         directional_derivatives : bool
             Whether to add directional derivatives.
+        of_members : bool
+            Whether to add the acceleration of several members at a time.
         """
         import casadi as cs
 
@@ -116,11 +123,12 @@ class TermFunctions:
             groups = terms.arguments.groups
             derivatives, new_lanes = derivative_functions(parts, state, direction, groups, lanes)
             functions, lanes = functions | derivatives, {**lanes, **new_lanes}
-        return cls(functions, lanes)
+        return cls(functions, lanes, of_members)
 
     def c_source(self) -> str:
         """Return the C source of all functions."""
-        return write_c_source([*self.functions.values()], self.lanes)
+        members = [self.functions["acceleration"]] if self.of_members else []
+        return write_c_source([*self.functions.values()], self.lanes, members)
 
 
 def _extract_numbers(

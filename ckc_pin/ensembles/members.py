@@ -414,14 +414,14 @@ class Members:
         if terms == "pinocchio":
             return None
         if terms == "generated":
-            return compile_terms(self.mechanism, which=varying_arguments)
-        library = find_compiled_terms(self.mechanism, varying_arguments)
+            return compile_terms(self.mechanism, which=varying_arguments, of_members=True)
+        library = find_compiled_terms(self.mechanism, varying_arguments, of_members=True)
         if library is not None or count < 2 or explain_too_large(self.mechanism):
             return library
         if count * self.count_rhs() < MIN_RHS_TO_COMPILE * self.mechanism.n:
             return None
         try:
-            return compile_terms(self.mechanism, which=varying_arguments)
+            return compile_terms(self.mechanism, which=varying_arguments, of_members=True)
         except InputError:  # without a compiler or CasADi, Pinocchio's terms are used
             return None
 

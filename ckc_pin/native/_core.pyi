@@ -768,6 +768,12 @@ class Batch:
         tolerance: float,
         threads: int,
     ) -> None: ...
+    @property
+    def lanes(self) -> int:
+        """
+        Members whose steps a thread computes together, in the processor's vector registers; 1 where the compiled terms or the controller do not allow it.
+        """
+
     def run(
         self,
         base: numpy.typing.NDArray[numpy.float64],

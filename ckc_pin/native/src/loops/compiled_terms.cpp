@@ -19,7 +19,8 @@ CompiledTerms::CompiledTerms(const std::string& path, In parameters)
     closure_code_ = find_code("place", 3), inertia_code_ = find_code("inertia", 3), bias_code_ = find_code("bias", 4);
     J_dot_code_ = find_code("jacobian_rate", 4), h_tree_code_ = find_code("rest", 3),
     coriolis_code_ = find_optional_code("coriolis", 5);
-    potential_energy_code_ = find_code("potential_energy", 3), acceleration_code_ = find_code("acceleration", 6);
+    potential_energy_code_ = find_code("potential_energy", 3), acceleration_code_ = find_code("acceleration", 6),
+    accelerations_code_ = find_optional_code("acceleration_of_members", 6);
     closure_step_code_ = find_code("closing_step", 4), jacobian_code_ = find_optional_code("jacobian", 5);
     state_code_ = find_optional_code("state", 5), derivative_code_ = find_optional_code("change", 2),
     derivatives_code_ = find_optional_code("changes", 2);
@@ -172,6 +173,14 @@ bool CompiledTerms::eliminate(In q, In v, In u_tree, In correction, Out accelera
   double* to[] = {acceleration.data(), &is_sound};
   acceleration_code_(from, to, nullptr, nullptr, 0);
   return is_sound > 0.0;
+}
+
+void CompiledTerms::accelerations(const Members* q, const Members* trig, const Members* v, const Members* u_tree,
+                                  const Members* correction, const Members* constants, Members* acceleration,
+                                  Members* is_sound) const {
+  const double* from[] = {q->of, trig->of, v->of, u_tree->of, correction->of, constants->of};
+  double* to[] = {acceleration->of, is_sound->of};
+  accelerations_code_(from, to, nullptr, nullptr, 0);
 }
 
 bool CompiledTerms::closure_step(In q, In residual, Out x) const {

@@ -36,6 +36,17 @@ class CompiledTerms {
     return elimination_allowed_ && eliminate(q, v, u_tree, correction, acceleration);
   }
   bool eliminate(In q, In v, In u_tree, In correction, Out acceleration) const;
+  // The same for `members` members of an ensemble at a time, if the library has that function. Arguments and results
+  // contain the members' values of one number one after the other. `is_sound` is not positive if a pivot is needed.
+  static constexpr int members = 8;
+  struct alignas(64) Members {  // one number of each member
+    double of[members];
+  };
+  bool has_accelerations() const { return accelerations_code_ && elimination_allowed_; }
+  void accelerations(const Members* q, const Members* trig, const Members* v, const Members* u_tree,
+                     const Members* correction, const Members* constants, Members* acceleration,
+                     Members* is_sound) const;
+  const Vector& constants() const { return constants_; }
   // Directional derivatives of the acceleration, if the library has them, at the state of `prepare_derivatives`, which
   // returns false as above. A direction is (derivative of q', of v', `added`), where `added` are the derivatives of u'
   // and of J v'_dot in the rows that the elimination uses. `directional_derivatives` takes `lanes` directions at a
@@ -82,7 +93,7 @@ class CompiledTerms {
   bool elimination_allowed_ = true;
   int lanes_ = 1, direction_size_ = 0;
   Code constants_code_, closure_code_, inertia_code_, bias_code_, J_dot_code_, h_tree_code_, coriolis_code_,
-      potential_energy_code_, acceleration_code_, closure_step_code_, jacobian_code_;
+      potential_energy_code_, acceleration_code_, accelerations_code_, closure_step_code_, jacobian_code_;
   Code state_code_, derivative_code_, derivatives_code_, groups_code_;
   std::vector<Code> parameter_codes_;
 };

@@ -58,6 +58,10 @@ void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_sca
 }
 
 void SmallestSingularValue::compute_dense() {
+  if (gram_.rows() == 2 && rank_ == 2) {  // one planar loop
+    smallest_ = 0.5 * (gram_(0, 0) + gram_(1, 1)) - std::hypot(0.5 * (gram_(0, 0) - gram_(1, 1)), gram_(0, 1));
+    return;
+  }
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
   smallest_ = eigen_.eigenvalues()(gram_.rows() - rank_);
 }

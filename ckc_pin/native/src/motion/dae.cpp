@@ -50,13 +50,30 @@ bool Dae::set_core_configuration(In y) {
   return true;
 }
 
+bool Dae::needs_core() const {
+  return !core.compiled || !core.joints.locked.empty() || force_needs_core() || is_stabilized() ||
+         core.has_released_rows();
+}
+
+const CompiledTerms* Dae::terms_of_rate() const {
+  const bool is_whole = size == motion_size && core.tree.roots.empty() && prescribed_joints().empty();
+  return is_whole && !needs_core() && core.compiled->has_accelerations() ? core.compiled.get() : nullptr;
+}
+
+bool Dae::force_of_rate(double t, In q_tree, In v, Out force) {
+  force.setZero();
+  if (!has_applied_force()) return true;
+  if (!compute_forces(t, q_tree, v)) return false;
+  force = applied_force(v);
+  return true;
+}
+
 bool Dae::motion_rhs(double t, In y, Out y_dot) {
   if (!finite(y)) return fail(RhsFailure::not_finite);
   const auto v = y.tail(core.n);
   v_tree = v;
   // Compiled terms give the acceleration without setting the core.
-  if (core.compiled && core.joints.locked.empty() && !force_needs_core() && !is_stabilized() &&
-      !core.has_released_rows()) {
+  if (!needs_core()) {
     q_tree_ = y.head(core.tree.nq);
     core.tree.normalize(q_tree_);
     const bool has_force = has_applied_force();

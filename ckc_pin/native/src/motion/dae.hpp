@@ -24,6 +24,9 @@ class Dae : public System {
   bool conserves_energy() const override { return projects_ && !core.has_row_motion(); }
   bool reduce_to_freedoms(In y, Matrix& jacobian) override;
   const Vector& configuration_at_last_rhs() const override { return q_tree_; }
+  const CompiledTerms* terms_of_rate() const override;
+  bool force_of_rate(double t, In q_tree, In v, Out force) override;
+  void set_last_rhs(In y) override { q_tree_ = y.head(core.tree.nq), v_tree = velocity_in(y); }
   void move_core_to_last_rhs(In y) override;
   bool tree_acceleration(In f, Out a) const override { return a = velocity_in(f), true; }
   void add_motion_velocity(Out y, In v) const override { y.segment(core.tree.nq, core.n) += v; }
@@ -31,6 +34,7 @@ class Dae : public System {
   bool rate_on_manifold(double t, In y, Out y_dot) override;
 
  private:
+  bool needs_core() const;  // whether the rate needs more than compiled terms
   bool motion_rhs(double t, In y, Out y_dot) override;
   bool motion_jacobian(double t, In y, Matrix& jacobian, long& evaluations) override;
   Eigen::Ref<const Vector> velocity_in(In y) const { return y.segment(core.tree.nq, core.n); }

@@ -20,6 +20,12 @@ void StepLoop::use_implicit_method() {
   use_method(*radau_);
 }
 
+Explicit* StepLoop::prepare_explicit_step(double& bound) {
+  bound = segment_end_;
+  if (!method_ || method_ == radau_.get() || !(now.t < bound) || prepare_step(bound)) return nullptr;
+  return method_ == &dop853_ ? &dop853_ : method_ == &rk45_ ? &rk45_ : nullptr;
+}
+
 // "auto" chooses the implicit method if damping or a controller makes the motion stiff.
 void StepLoop::choose_method(double bound) {
   const bool may_be_stiff = options_.method == "auto" && (control->is_feedback() || system->core.springs.has_damping ||

@@ -75,6 +75,8 @@ struct Breakpoints {
 enum class WorkOf { motors, dampers, friction, forces };
 constexpr int work_count = 4;
 
+class CompiledTerms;
+
 class System {
  public:
   System(Core& core, Control& control, int motion_size);
@@ -153,6 +155,13 @@ class System {
   virtual bool rate_on_manifold(double, In, Out) { return false; }
   // Configuration of the last right-hand side. Its velocity is `v_tree`.
   virtual const Vector& configuration_at_last_rhs() const { return core.q_tree; }
+  // Compiled terms that alone give the rate of y = (q', v') from the applied force; null if the rate needs more.
+  virtual const CompiledTerms* terms_of_rate() const { return nullptr; }
+  bool has_applied_force() const { return control.is_active() || forces_ || core.joints.exerts_force(); }
+  // The force applied to the tree where `terms_of_rate` gives the rate. False if there is none.
+  virtual bool force_of_rate(double /*t*/, In /*q_tree*/, In /*v*/, Out /*force*/) { return false; }
+  // Take y as the state of the last right-hand side, whose rate was computed elsewhere.
+  virtual void set_last_rhs(In) {}
   // Move the core and `v_tree` to the state y of the last right-hand side, if compiled terms have left them elsewhere.
   virtual void move_core_to_last_rhs(In) {}
   // Acceleration of the tree at the last right-hand side. False if unknown.
@@ -222,7 +231,6 @@ class System {
   virtual bool sync_motion_unprojected(double t, In y) { return sync_motion(t, y); }
   // Whether control or forces need the core at the state.
   bool force_needs_core() const { return control.needs_terms() || forces_ || law_size_; }
-  bool has_applied_force() const { return control.is_active() || forces_ || core.joints.exerts_force(); }
   // Called before and after finite differences.
   virtual void project_exactly(bool) {}
   // `rhs` and `jacobian` of the motion. All arguments have the motion's entries only. The default Jacobian uses finite

@@ -49,13 +49,17 @@ Evaluate select_evaluation() { return evaluate_scalar; }
 
 }  // namespace
 
-const double* Trig::compute(In x) const {
+void compute_cosines_and_sines(const double* x, Eigen::Index count, double* cosines, double* sines) {
   static const Evaluate evaluate = select_evaluation();
+  evaluate(x, count, cosines, sines);
+}
+
+const double* Trig::compute(In x) const {
   const Eigen::Index size = x.size(), padded_size = (size + lanes - 1) / lanes * lanes;
   if (x_.size() != size) padded_.setZero(padded_size), values_.setZero(size + padded_size);
   x_ = padded_.head(size) = x;
   // the sines overwrite the padding of the cosines
-  evaluate(padded_.data(), padded_size, values_.data(), values_.data() + size);
+  compute_cosines_and_sines(padded_.data(), padded_size, values_.data(), values_.data() + size);
   return values_.data();
 }
 

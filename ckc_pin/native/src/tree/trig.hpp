@@ -5,6 +5,9 @@
 
 namespace ckc {
 
+// Compute cosines and sines of numbers, as many as a multiple of four. They may lie one behind the other in memory.
+void compute_cosines_and_sines(const double* x, Eigen::Index count, double* cosines, double* sines);
+
 class Trig {
  public:
   // Return the cosines of x, followed by the sines. They are computed again only if x has changed.

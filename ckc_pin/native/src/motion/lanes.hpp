@@ -1,0 +1,49 @@
+// Stages of an explicit method for several members of an ensemble at a time, each member in its own lane of the
+// processor's vector registers. Everything else in a step is each member's own, and so are its size and its end.
+//
+// A member's results have the same digits as alone: the operations are those of `Explicit` and of the compiled terms, in
+// the same order.
+#pragma once
+
+#include <array>
+
+#include "loops/compiled_terms.hpp"
+#include "motion/explicit.hpp"
+
+namespace ckc {
+
+class Lanes {
+ public:
+  static constexpr int width = CompiledTerms::members;
+  // The next step of a member: its method, and the time that the step must not exceed.
+  struct Attempt {
+    Explicit* method;
+    double bound;
+  };
+  // Set the mechanism's numbers of the member in a lane.
+  void set_constants(int lane, const Vector& constants);
+  // Compute the stages of the first attempts of these members, by lane; `method` is null where there is no member, or
+  // where its next step cannot be computed here. The methods take them when they make that step.
+  void compute(const std::array<Attempt, width>& attempts);
+
+ private:
+  using Members = CompiledTerms::Members;
+  using Lines = std::vector<Members>;
+  void compute(const std::array<Attempt, width>& attempts, Explicit::Kind kind);
+  void start(const std::array<Attempt, width>& attempts, const Explicit& first);
+  void evaluate(double stage_time, int stage);  // the rate at y_, and which lanes stay valid
+  void apply_forces(double stage_time);
+  template <class Coefficients>
+  void combine(const Coefficients& coefficients, int count);  // y_ = y at the start + the combination of rates
+
+  Explicit* methods_[width];  // null: the lane's stages are not valid
+  const CompiledTerms* terms_ = nullptr;
+  int n_ = 0, size_ = 0;
+  bool has_force_ = false;
+  double t_[width];
+  Members h_;
+  Lines start_, y_, rates_, factors_, trig_, force_, correction_, constants_;
+  Vector q_tree_, v_, applied_;
+};
+
+}  // namespace ckc
