@@ -13,6 +13,7 @@ import pytest
 from scripts.experiments.benchmark.peers import compiled
 from scripts.experiments.benchmark.peers.pinocchio_loop import PinocchioLoop
 from scripts.experiments.benchmark.work import WORKS, Work
+from scripts.experiments.right_hand_sides import measure
 from tests.analytic.five_bar import FIVE_BAR
 
 LOOP, LCABA = PinocchioLoop("constraintDynamics"), PinocchioLoop("lcaba")
@@ -149,3 +150,13 @@ def test_compiler_error_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CXX", raising=False)
     assert LOOP.missing(ONE_SQUARE) == "it does not compile: loop.cpp:3: error: no such header"
+
+
+@compiles
+def test_right_hand_sides_are_timed_with_all_terms() -> None:
+    row = measure("1")
+    assert (row.n, row.d) == (3, 1)
+    assert row.compiled_s is not None
+    assert row.lcaba_s is not None
+    assert 0 < row.compiled_s < row.pinocchio_s
+    assert len(row.row().split("|")) == 10
