@@ -116,15 +116,18 @@ def import_(file: Path, repair: bool, out: Path | None, overwrite: bool, as_json
 
 @click.command(
     epilog=options.format_examples(
-        "ckc export five_bar --to mjcf > five_bar.xml", "ckc export mine --to mjcf --out models"
+        "ckc export five_bar --to mjcf > five_bar.xml",
+        "ckc export mine --to mjcf --out models",
+        "ckc export five_bar --to c --out controller",
     )
 )
 @options.mechanism
 @click.option(
     "--to",
-    type=click.Choice(["mjcf", "urdf", "sdf"]),
+    type=click.Choice(["mjcf", "urdf", "sdf", "c"]),
     default="mjcf",
-    help="mjcf: for MuJoCo; urdf: a tree with <loop> elements; sdf: for Gazebo, with loops as joints.",
+    help="mjcf: for MuJoCo; urdf: a tree with <loop> elements; sdf: for Gazebo, with loops as joints; c: C99 of the "
+    "dynamics and the controllers, for the computer of a robot.",
 )
 @options.out(help="Folder to write to; without it the model is printed.")
 @options.overwrite
@@ -133,11 +136,13 @@ def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: 
     """Convert a mechanism for another program. Lists how its motion differs there."""
     from ckc_pin.formats import exporting
 
+    if to == "c" and out is None:
+        raise InputError("export: --to c writes several files; give their folder as --out DIR")
     with Spinner(f"export of {mechanism}"):
         loaded = ckc_pin.load(mechanism)
         is_measured = to == "mjcf" and find_spec("mujoco") is not None
         exported = _export_to_mujoco(loaded) if is_measured else exporting.export(loaded, to)
-    paths = [] if out is None else [exporting.write(exported, out, overwrite)]
+    paths = [] if out is None else exporting.write(exported, out, overwrite)
     if as_json:
         text = {} if paths else {"text": exported.text}
         written = [str(path) for path in paths]

@@ -5,6 +5,7 @@ A result that is NaN marks an unused place of the result: no value of its own is
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from math import isnan
@@ -12,7 +13,15 @@ from typing import Any
 
 from ckc_pin.codegen.graph import Graph, Lane, Packing
 
-__all__ = ["LaneMap", "count_operations", "count_statements", "split_column", "trace_result_lanes", "write_c_source"]
+__all__ = [
+    "LaneMap",
+    "count_operations",
+    "count_statements",
+    "split_column",
+    "trace_result_lanes",
+    "write_c_source",
+    "write_static_function",
+]
 
 LaneMap = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: the lane, and the shared number
 
@@ -52,6 +61,11 @@ def _operation_formats() -> tuple[dict[int, str], dict[int, str]]:
 def write_c_source(functions: Sequence[Any], lanes: LaneMap) -> str:
     """Return the C source of CasADi functions. Callers must pass all arguments and ask for all results."""
     return HEAD + "".join(_FunctionWriter(function, lanes).write() for function in functions)
+
+
+def write_static_function(function: Any, name: str) -> str:
+    """Return a CasADi function as a static function of portable C99: pointers to its arguments, then to its results."""
+    return _FunctionWriter(function, {}).write_static(name)
 
 
 def trace_result_lanes(function: Any, result: str, lanes: LaneMap) -> dict[int, tuple[Lane, int]]:
@@ -125,6 +139,16 @@ class _FunctionWriter:
             *_size_functions(f"{name}_%s_out", [f.size_out(k) for k in range(f.n_out())]),
         ]
         return "\n".join([head, *self.lines, "return 0;", "}", *sizes, ""])
+
+    def write_static(self, name: str) -> str:
+        """Return the function in C99, without the vectors that only GCC and Clang have."""
+        self._write_results()
+        inputs = [f"x{k}" for k in range(self.function.n_in())]
+        outputs = [f"y{k}" for k in range(self.function.n_out())]
+        text = "\n".join(self.lines)
+        unused = [f"(void){x};" for x in (*inputs, *outputs) if not re.search(rf"\b{x}\[", text)]
+        parameters = [*(f"const double *restrict {x}" for x in inputs), *(f"double *restrict {y}" for y in outputs)]
+        return "\n".join([f"static void {name}({', '.join(parameters)}) {{", *unused, *self.lines, "}", ""])
 
     def _write_results(self) -> None:
         """Write the operations of each result as late as possible, which keeps few numbers alive."""
