@@ -11,9 +11,9 @@ __all__ = ["comment", "identifiers", "initializer", "table"]
 NUMBERS_A_LINE = 6
 
 
-def identifiers(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return names with the letters, digits and underscores that C allows, all different and none of them `taken`."""
-    used, result = set(taken), list[str]()
+def identifiers(names: Iterable[str]) -> list[str]:
+    """Return names with the letters, digits and underscores that C allows, all different."""
+    used, result = set[str](), list[str]()
     for name in names:
         base = re.sub(r"[^A-Za-z0-9_]", "_", name)
         identifier, count = base, 1
