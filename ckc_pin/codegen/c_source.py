@@ -51,8 +51,8 @@ def _operation_formats() -> tuple[dict[int, str], dict[int, str]]:
     scalar = {
         cs.OP_ASSIGN: "{0}", cs.OP_SQRT: "sqrt({0})", cs.OP_SIN: "sin({0})", cs.OP_COS: "cos({0})",
         cs.OP_TAN: "tan({0})", cs.OP_ATAN2: "atan2({0},{1})", cs.OP_FABS: "fabs({0})", cs.OP_LT: "{0}<{1}",
-        cs.OP_LE: "{0}<={1}", cs.OP_EQ: "{0}=={1}", cs.OP_NE: "{0}!={1}", cs.OP_NOT: "!{0}",
-        cs.OP_AND: "{0}&&{1}", cs.OP_OR: "{0}||{1}", cs.OP_IF_ELSE_ZERO: "{0}?{1}:0",
+        cs.OP_LE: "{0}<={1}", cs.OP_EQ: "{0}=={1}", cs.OP_NE: "{0}!={1}", cs.OP_NOT: "{0}==0",
+        cs.OP_AND: "{0}!=0&&{1}!=0", cs.OP_OR: "{0}!=0||{1}!=0", cs.OP_IF_ELSE_ZERO: "{0}!=0?{1}:0",
         cs.OP_FMIN: "fmin({0},{1})", cs.OP_FMAX: "fmax({0},{1})",
     }  # fmt: skip
     return both | scalar, {**both, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}

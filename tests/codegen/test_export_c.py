@@ -122,6 +122,13 @@ def test_exported_c_compiles_without_warnings_and_agrees_with_pinocchio(
     assert run("./main", cwd=folder).count("desired") == load(name).d
 
 
+def test_exported_c_does_not_convert_numbers_to_truth_values(folder_of: Callable[[str], Path]) -> None:
+    """Clang's -Wconversion warns of it, and GCC does not. The springs of andrews have conditions."""
+    text = (folder_of("andrews") / "andrews.c").read_text()
+    assert text.count("!=0?") > 2
+    assert not re.search(r"[=(&|]a\d+(\?|&&|\|\|)|!a\d", text)
+
+
 @pytest.mark.parametrize("name", ["five_bar", "delta", "bricard"])
 def test_exported_c_has_no_undefined_behaviour(name: str, folder_of: Callable[[str], Path]) -> None:
     folder = folder_of(name)

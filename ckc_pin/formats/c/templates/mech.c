@@ -113,7 +113,8 @@ static void compute_rho(mech_configuration *at) {
   for (int k = 0; k < MECH_D; ++k) {
     double z[MECH_SIZE(MECH_Z)], *column = at->rho + MECH_N * k;
     close_rows(at, at->J + MECH_ROWS * INDEPENDENT[k], z);
-    for (int i = 0; i < MECH_D; ++i) column[INDEPENDENT[i]] = i == k ? 1.0 : 0.0;
+    for (int i = 0; i < MECH_D; ++i) column[INDEPENDENT[i]] = 0.0;
+    column[INDEPENDENT[k]] = 1.0;
     for (int i = 0; i < MECH_Z; ++i) column[DEPENDENT[i]] = z[i];
   }
 }
@@ -215,13 +216,19 @@ double mech_potential_energy(const mech_model *model, const mech_configuration *
   return energy;
 }
 
-void mech_D(const mech_model *model, const mech_configuration *at, double *D) {
-  double D_tree[MECH_N * MECH_N], column[MECH_N];
-  mech_D_tree(model, at, D_tree);
+/* D = rho^T D' rho */
+static void project_inertia(const mech_configuration *at, const double *D_tree, double *D) {
+  double column[MECH_N];
   for (int k = 0; k < MECH_D; ++k) {
     multiply(D_tree, at->rho + MECH_N * k, column, MECH_N, MECH_N);
     multiply_transposed(at->rho, column, D + MECH_D * k, MECH_N, MECH_D);
   }
+}
+
+void mech_D(const mech_model *model, const mech_configuration *at, double *D) {
+  double D_tree[MECH_N * MECH_N];
+  mech_D_tree(model, at, D_tree);
+  project_inertia(at, D_tree, D);
 }
 
 /* Force on the tree D' (rho a + rho_dot x) + C' rho x at the velocity q_dot. Its projection by rho^T is D a + C x. */
@@ -240,14 +247,14 @@ static void inertial_force(const mech_model *model, const mech_configuration *at
 }
 
 void mech_C(const mech_model *model, const mech_configuration *at, const double *q_dot, double *C) {
-  double D_tree[MECH_N * MECH_N], unit[MECH_D] = {0.0}, force[MECH_N];
+  double D_tree[MECH_N * MECH_N], force[MECH_N];
   const double none[MECH_D] = {0.0};
   mech_D_tree(model, at, D_tree);
   for (int k = 0; k < MECH_D; ++k) {
+    double unit[MECH_D] = {0.0};
     unit[k] = 1.0;
     inertial_force(model, at, D_tree, q_dot, unit, none, force);
     multiply_transposed(at->rho, force, C + MECH_D * k, MECH_N, MECH_D);
-    unit[k] = 0.0;
   }
 }
 
@@ -282,11 +289,12 @@ mech_status mech_acceleration(const mech_model *model, const mech_configuration 
 /* u = D a + C x + h less the force of dampers at the velocity q_dot if `damped`. */
 static void reduced_force(const mech_model *model, const mech_configuration *at, const double *D_tree,
                           const double *q_dot, const double *x, const double *a, int damped, double *u) {
-  double force[MECH_N], h_tree[MECH_N], v_tree[MECH_N], J_dot_v[MECH_SIZE(MECH_ROWS)], damping[MECH_N];
+  double force[MECH_N], h_tree[MECH_N];
   inertial_force(model, at, D_tree, q_dot, x, a, force);
   mech_h_tree(model, at, h_tree);
   for (int k = 0; k < MECH_N; ++k) force[k] += h_tree[k];
   if (damped) {
+    double v_tree[MECH_N], J_dot_v[MECH_SIZE(MECH_ROWS)], damping[MECH_N];
     mech_velocity(at, q_dot, v_tree);
     mech_bias_tree(model, at, v_tree, h_tree, J_dot_v, damping);
     for (int k = 0; k < MECH_N; ++k) force[k] -= damping[k];
@@ -296,18 +304,15 @@ static void reduced_force(const mech_model *model, const mech_configuration *at,
 
 mech_status mech_forward_dynamics(const mech_model *model, const mech_configuration *at, const double *q_dot,
                                   const double *tau, double *q_ddot) {
-  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], column[MECH_N], force[MECH_D], u_tree[MECH_N];
+  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], force[MECH_D], u_tree[MECH_N];
   const double none[MECH_D] = {0.0};
   int pivot[MECH_D];
   mech_D_tree(model, at, D_tree);
   reduced_force(model, at, D_tree, q_dot, q_dot, none, 1, force);
   multiply_transposed(TRANSMISSION, tau, u_tree, MECH_MOTORS, MECH_N);
   multiply_transposed(at->rho, u_tree, q_ddot, MECH_N, MECH_D);
-  for (int k = 0; k < MECH_D; ++k) {
-    q_ddot[k] -= force[k];
-    multiply(D_tree, at->rho + MECH_N * k, column, MECH_N, MECH_N);
-    multiply_transposed(at->rho, column, D + MECH_D * k, MECH_N, MECH_D);
-  }
+  for (int k = 0; k < MECH_D; ++k) q_ddot[k] -= force[k];
+  project_inertia(at, D_tree, D);
   if (!factorize(D, pivot, MECH_D)) return MECH_SINGULAR;
   solve(D, pivot, MECH_D, q_ddot);
   return is_finite(q_ddot, MECH_D) ? MECH_OK : MECH_NOT_FINITE;
