@@ -34,7 +34,7 @@ FUNCTIONS = {
 # x = v equal to C' v' and J_dot v'. Projected by rho^T, it gives C x of eq. 6 for trees with and without a free root.
 PORTABLE_FUNCTIONS = {
     name: FUNCTIONS[name] for name in ("place", "inertia", "bias", "rest", "potential_energy", "acceleration")
-} | {"bilinear": (("q", "v", "x"), ("bias_x", "J_dot_x"))}
+} | {"bilinear": (("q", "v", "x"), ("bias_x", "J_dot_x")), "points": (("q", "v"), ("positions", "velocities"))}
 # Limit of (operations of the acceleration) * n, about twice the operations of its derivatives. `jacobian` is left out
 # above it.
 MAX_JACOBIAN_OPERATIONS = 3e4
@@ -181,6 +181,7 @@ def _results(
     if portable:
         velocity_terms = cs.vertcat(terms.bias_tree, rows.J_dot_v)
         bilinear = cs.jtimes(velocity_terms, terms.v, symbols["x"]) / 2
+        results["positions"], results["velocities"] = terms.points
         results["bias_x"], results["J_dot_x"] = split_column(bilinear, [terms.v.numel(), rows.phi.numel()])
         return {name: cs.densify(x) for name, x in results.items()}
     J_dot = terms.configuration.directional_derivative(cs.vec(rows.J), terms.q_dot)

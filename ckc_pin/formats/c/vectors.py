@@ -26,7 +26,8 @@ QUANTITIES = {
     "J_dot_v": "MECH_ROWS", "damping": "MECH_N", "h_tree": "MECH_N", "potential": "1", "acceleration": "MECH_N",
     "multipliers": "MECH_ROWS", "sigma": "MECH_NQ", "rho": "MECH_N * MECH_D", "D_reduced": "MECH_D * MECH_D",
     "C_reduced": "MECH_D * MECH_D", "h_reduced": "MECH_D", "inverse": "MECH_D", "forward": "MECH_D",
-    "set_point": "MECH_D", "set_point_tau": "MECH_MOTORS", "tracking": "MECH_D",
+    "tree_acceleration": "MECH_N", "positions": "3 * MECH_POINTS", "velocities": "3 * MECH_POINTS", "set_point": "MECH_D",
+    "set_point_tau": "MECH_MOTORS", "tracking": "MECH_D",
 }  # fmt: skip
 INPUTS = {
     "q_tree": "MECH_NQ", "v_tree": "MECH_N", "u_tree": "MECH_N", "guess": "MECH_NQ", "q": "MECH_D", "q_dot": "MECH_D",
@@ -120,6 +121,10 @@ def _make_vector(
     results = {name: x for name, x in reference_terms(tree).items() if name != "J_dot"}
     results["acceleration"] = acceleration, 0.0
     results["multipliers"] = _multipliers(tree, acceleration, u_tree), float(np.abs(u_tree).max())
+    jacobians = list(mechanism.point_jacobians(tree.q_tree).values())
+    velocities = np.ravel([jacobian @ tree.v_tree for jacobian in jacobians])
+    results["positions"] = np.ravel(list(mechanism.point_positions(tree.q_tree).values())), mechanism.size
+    results["velocities"] = velocities, float(np.abs(velocities).max(initial=0.0))
     results |= _reduced_results(reduced, q_ddot, tau)
     u_set_point, u_tracking = set_point.u(0.0, reduced), tracking.u(0.0, reduced)
     results["set_point"] = u_set_point, float(np.abs(gains[0]).max())
@@ -146,6 +151,7 @@ def _reduced_results(terms: Terms, q_ddot: Array, tau: Array) -> dict[str, tuple
         "C_reduced": (terms.C, D * rho * speed),
         "h_reduced": (terms.h, h),
         "inverse": (at.rho.T @ tree_force(terms, acceleration), D * float(np.abs(acceleration).max()) + h),
+        "tree_acceleration": (acceleration, float(np.abs(acceleration).max())),
         "forward": (reduced_acceleration(terms, motors.force(tau)), 0.0),
     }
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.codegen.arguments import argument_names, present, values
+from ckc_pin.codegen.arguments import argument_names, argument_units, present, values
 from ckc_pin.codegen.c_source import count_operations, write_static_function
 from ckc_pin.codegen.comparison import TERMS_TOLERANCE
 from ckc_pin.codegen.library import derive_term_functions, explain_too_large
@@ -24,7 +24,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.tree import LARGE_COORDINATE, MAX_TOLERANCE_FACTOR
 
-__all__ = ["to_c"]
+__all__ = ["TEMPLATES", "fill_templates", "make_prefix", "require_exportable", "to_c"]
 
 TEMPLATES = Path(__file__).parent / "templates"  # `mech` and `MECH` in names and texts are replaced by the prefix
 FRAME_BYTES = 256  # of a call: return address, saved registers, parameters, loop counters
@@ -33,12 +33,6 @@ RESERVED_PREFIXES = {
     "assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math", "setjmp",
     "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar", "wctype",
     "features", "main", "all", "clean", "help", "install", "package", "test", "c", "m", "t",
-}  # fmt: skip
-UNITS = {
-    "gravity": "m/s^2", "offset": "m", "mass": "kg", "centre": "m", "inertia": "kg m^2", "armature": "kg m^2 or kg",
-    "rotors": "kg m^2", "point": "m", "length": "m", "constant": "N m or N", "joint_stiffness": "N m/rad or N/m",
-    "joint_rest": "rad or m", "joint_damping": "N m s/rad or N s/m", "end": "m", "stiffness": "N/m",
-    "rest_length": "m", "damping": "N s/m",
 }  # fmt: skip
 
 
@@ -56,9 +50,27 @@ def to_c(mechanism: Mechanism, stem: str) -> tuple[dict[str, str], list[str]]:
     InputError
         A part of the mechanism is not supported in C, it is too large for compiled terms, or CasADi is missing.
     """
-    _require_exportable(mechanism)
+    require_exportable(mechanism, f"{mechanism.name}: export to c")
+    texts = {path.name: path.read_text(encoding="ascii") for path in sorted(TEMPLATES.iterdir())}
+    texts["mech_vectors.h"] = write_vectors(mechanism)
+    return fill_templates(mechanism, make_prefix(stem), texts), _omissions(mechanism)
+
+
+def fill_templates(
+    mechanism: Mechanism, prefix: str, texts: Mapping[str, str], more: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return templates by file name with a mechanism's code, sizes and names.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    prefix : str
+        Replaces `mech` in names of files and functions.
+    texts : mapping
+    more : mapping, optional
+        Further texts, which replace ``@KEY@``.
+    """
     functions = derive_term_functions(mechanism, portable=True).functions
-    prefix = _prefix(stem)
     enumerators = _enumerators(mechanism, prefix)
     substitutions = {
         **_sizes(mechanism, functions),
@@ -79,18 +91,16 @@ def to_c(mechanism: Mechanism, stem: str) -> tuple[dict[str, str], list[str]]:
         "STEP": repr(float(mechanism.tree.step_scale[mechanism.partition.q].min())),
         "QUANTITY_NAMES": ", ".join(f'"{name}"' for name in QUANTITIES),
         "TEST_TOLERANCE": repr(TERMS_TOLERANCE),
+        **(more or {}),
     }
-    texts = {path.name: path.read_text(encoding="ascii") for path in sorted(TEMPLATES.iterdir())}
-    texts["mech_vectors.h"] = write_vectors(mechanism)
     files = {_name(file, prefix): _name(text, prefix) for file, text in texts.items()}
     for key, text in substitutions.items():
         files = {file: content.replace(f"@{key}@", text) for file, content in files.items()}
-    return files, _omissions(mechanism)
+    return files
 
 
-def _require_exportable(mechanism: Mechanism) -> None:
+def require_exportable(mechanism: Mechanism, where: str) -> None:
     """Raise InputError for parts of a mechanism that would move differently in the C code."""
-    where = f"{mechanism.name}: export to c"
     mechanism.refuse_prescribed_joints(where)
     if reason := explain_too_large(mechanism):
         raise InputError(f"{where}: {reason}")
@@ -98,7 +108,7 @@ def _require_exportable(mechanism: Mechanism) -> None:
     if rough:
         raise InputError(
             f"{where}: dry friction of {', '.join(rough)} is not supported, since sticking needs events; set "
-            "friction = 0, and compensate friction outside of the C code"
+            "friction = 0, and add friction as a force outside of the exported code"
         )
     if mechanism.d == 0:
         raise InputError(f"{where}: the mechanism has no freedom, so there is nothing to control")
@@ -129,7 +139,8 @@ def _omissions(mechanism: Mechanism) -> list[str]:
     return notes
 
 
-def _prefix(stem: str) -> str:
+def make_prefix(stem: str) -> str:
+    """Return an identifier of C in lower case."""
     prefix = re.sub(r"[^a-z0-9_]", "_", stem.lower())
     return f"m_{prefix}" if not prefix[0].isalpha() or prefix in RESERVED_PREFIXES else prefix
 
@@ -148,6 +159,7 @@ def _sizes(mechanism: Mechanism, functions: Mapping[str, Any]) -> dict[str, str]
         "Z": mechanism.n - mechanism.d,
         "ROWS": mechanism.closure.rows,
         "MOTORS": len(mechanism.motors.names),
+        "POINTS": len(mechanism.points),
         "PARAMETERS": functions["numbers"].numel_in(0),
         "NUMBERS": functions["numbers"].numel_out(0),
     }
@@ -213,11 +225,10 @@ def _parameters(mechanism: Mechanism) -> dict[str, str]:
     """Return the fields of the struct of parameters, and a list of them."""
     which = present(model_numbers(mechanism))
     names = argument_names(mechanism, which)
-    units = [UNITS[kind] for kind, there in which.items() for _ in range(int(np.count_nonzero(there)))]
+    units = [f", {unit}".replace("²", "^2") if unit else "" for unit in argument_units(mechanism, which)]
     fields = identifiers(names)
     lines = [
-        f"  double {field}; /* {comment(name)}, {unit} */"
-        for field, name, unit in zip(fields, names, units, strict=True)
+        f"  double {field}; /* {comment(name)}{unit} */" for field, name, unit in zip(fields, names, units, strict=True)
     ]
     return {"FIELDS": "\n".join(lines), "OWN": ", ".join(f"parameters->{field}" for field in fields)}
 

@@ -197,6 +197,20 @@ void mech_velocity(const mech_configuration *at, const double *q_dot, double *v_
   multiply(at->rho, q_dot, v_tree, MECH_N, MECH_D);
 }
 
+void mech_tree_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                            const double *q_ddot, double *acceleration) {
+  double bias_tree[MECH_N], damping[MECH_N], J_dot_v[MECH_SIZE(MECH_ROWS)], z[MECH_SIZE(MECH_Z)];
+  mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
+  close_rows(at, J_dot_v, z);
+  multiply(at->rho, q_ddot, acceleration, MECH_N, MECH_D);
+  for (int k = 0; k < MECH_Z; ++k) acceleration[DEPENDENT[k]] += z[k];
+}
+
+void mech_points(const mech_model *model, const mech_configuration *at, const double *v_tree, double *positions,
+                 double *velocities) {
+  code_points(at->q_tree, at->trig, v_tree, model->numbers, positions, velocities);
+}
+
 void mech_D_tree(const mech_model *model, const mech_configuration *at, double *D_tree) {
   code_inertia(at->q_tree, at->trig, model->numbers, D_tree);
 }
@@ -266,12 +280,10 @@ void mech_h(const mech_model *model, const mech_configuration *at, double *h) {
 
 /* --- dynamics --- */
 
-mech_status mech_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
-                              const double *u_tree, double *acceleration, double *multipliers) {
-  double accuracy, D_tree[MECH_N * MECH_N], force[MECH_N], bias_tree[MECH_N], damping[MECH_N];
+void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                      const double *u_tree, const double *acceleration, double *multipliers) {
+  double D_tree[MECH_N * MECH_N], force[MECH_N], bias_tree[MECH_N], damping[MECH_N];
   double J_dot_v[MECH_SIZE(MECH_ROWS)], z[MECH_SIZE(MECH_Z)];
-  const double correction[MECH_SIZE(MECH_ROWS)] = {0.0};
-  code_acceleration(at->q_tree, at->trig, v_tree, u_tree, correction, model->numbers, acceleration, &accuracy);
   mech_D_tree(model, at, D_tree);
   mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
   multiply(D_tree, acceleration, force, MECH_N, MECH_N);
@@ -282,6 +294,14 @@ mech_status mech_acceleration(const mech_model *model, const mech_configuration 
   solve_transposed(at->phi_z, at->pivot, MECH_Z, z);
   for (int i = 0; i < MECH_ROWS; ++i) multipliers[i] = 0.0;
   for (int k = 0; k < MECH_Z; ++k) multipliers[KEPT[k]] = z[k];
+}
+
+mech_status mech_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                              const double *u_tree, double *acceleration, double *multipliers) {
+  double accuracy;
+  const double correction[MECH_SIZE(MECH_ROWS)] = {0.0};
+  code_acceleration(at->q_tree, at->trig, v_tree, u_tree, correction, model->numbers, acceleration, &accuracy);
+  mech_multipliers(model, at, v_tree, u_tree, acceleration, multipliers);
   if (!is_finite(acceleration, MECH_N)) return MECH_NOT_FINITE;
   return accuracy > 0.0 ? MECH_OK : MECH_INACCURATE;
 }
@@ -302,14 +322,17 @@ static void reduced_force(const mech_model *model, const mech_configuration *at,
   multiply_transposed(at->rho, force, u, MECH_N, MECH_D);
 }
 
+void mech_motor_force(const double *tau, double *u_tree) {
+  multiply_transposed(TRANSMISSION, tau, u_tree, MECH_MOTORS, MECH_N);
+}
+
 mech_status mech_forward_dynamics(const mech_model *model, const mech_configuration *at, const double *q_dot,
-                                  const double *tau, double *q_ddot) {
-  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], force[MECH_D], u_tree[MECH_N];
+                                  const double *u_tree, double *q_ddot) {
+  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], force[MECH_D];
   const double none[MECH_D] = {0.0};
   int pivot[MECH_D];
   mech_D_tree(model, at, D_tree);
   reduced_force(model, at, D_tree, q_dot, q_dot, none, 1, force);
-  multiply_transposed(TRANSMISSION, tau, u_tree, MECH_MOTORS, MECH_N);
   multiply_transposed(at->rho, u_tree, q_ddot, MECH_N, MECH_D);
   for (int k = 0; k < MECH_D; ++k) q_ddot[k] -= force[k];
   project_inertia(at, D_tree, D);
@@ -323,6 +346,10 @@ void mech_inverse_dynamics(const mech_model *model, const mech_configuration *at
   double D_tree[MECH_N * MECH_N];
   mech_D_tree(model, at, D_tree);
   reduced_force(model, at, D_tree, q_dot, q_dot, q_ddot, 1, u);
+}
+
+void mech_limit_torques(double *tau) {
+  for (int k = 0; k < MECH_MOTORS; ++k) tau[k] = fmin(fmax(tau[k], LOWEST_TAU[k]), HIGHEST_TAU[k]);
 }
 
 mech_status mech_motor_torques(const mech_configuration *at, const double *u, double *tau) {
@@ -354,7 +381,7 @@ mech_status mech_motor_torques(const mech_configuration *at, const double *u, do
 #else
   multiply(drive, y, tau, MECH_MOTORS, MECH_D);
 #endif
-  for (int k = 0; k < MECH_MOTORS; ++k) tau[k] = fmin(fmax(tau[k], LOWEST_TAU[k]), HIGHEST_TAU[k]);
+  mech_limit_torques(tau);
   return is_finite(y, MECH_D) ? MECH_OK : MECH_NOT_FINITE;
 #endif
 }
@@ -364,8 +391,9 @@ mech_status mech_motor_torques(const mech_configuration *at, const double *u, do
 mech_status mech_advance(const mech_model *model, mech_motion *motion, const double *tau, double step) {
   static const double part[4] = {0.0, 0.5, 0.5, 1.0}, weight[4] = {1.0 / 6, 1.0 / 3, 1.0 / 3, 1.0 / 6};
   mech_configuration at = motion->at;
-  double q[MECH_D], q_dot[MECH_D], q_ddot[MECH_D], dq[MECH_D] = {0.0}, dv[MECH_D] = {0.0};
+  double u_tree[MECH_N], q[MECH_D], q_dot[MECH_D], q_ddot[MECH_D], dq[MECH_D] = {0.0}, dv[MECH_D] = {0.0};
   mech_status status;
+  mech_motor_force(tau, u_tree);
   for (int k = 0; k < MECH_D; ++k) q_dot[k] = motion->q_dot[k];
   for (int stage = 0; stage < 4; ++stage) {
     if (stage > 0) {
@@ -376,7 +404,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
       status = mech_sigma(model, q, &at);
       if (status != MECH_OK) return status;
     }
-    status = mech_forward_dynamics(model, &at, q_dot, tau, q_ddot);
+    status = mech_forward_dynamics(model, &at, q_dot, u_tree, q_ddot);
     if (status != MECH_OK) return status;
     for (int k = 0; k < MECH_D; ++k) {
       dq[k] += weight[stage] * step * q_dot[k];

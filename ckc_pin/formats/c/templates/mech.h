@@ -22,6 +22,7 @@ extern "C" {
 #define MECH_Z @Z@ /* dependent coordinates z */
 #define MECH_ROWS @ROWS@ /* constraint rows, phi */
 #define MECH_MOTORS @MOTORS@
+#define MECH_POINTS @POINTS@ /* points that the mechanism names */
 #define MECH_PARAMETERS @PARAMETERS@
 #define MECH_NUMBERS @NUMBERS@ /* what a model stores */
 #define MECH_SIZE(n) ((n) > 0 ? (n) : 1)
@@ -97,6 +98,14 @@ mech_status mech_move(const mech_model *model, const double *q, mech_configurati
 /* v' = rho q_dot */
 void mech_velocity(const mech_configuration *at, const double *q_dot, double *v_tree);
 
+/* dv'/dt = rho q_ddot + rho_dot q_dot */
+void mech_tree_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                            const double *q_ddot, double *acceleration);
+
+/* Positions and velocities of the mechanism's points in the world, (3, MECH_POINTS) each. */
+void mech_points(const mech_model *model, const mech_configuration *at, const double *v_tree, double *positions,
+                 double *velocities);
+
 /* D', (MECH_N, MECH_N) */
 void mech_D_tree(const mech_model *model, const mech_configuration *at, double *D_tree);
 
@@ -117,17 +126,27 @@ void mech_h(const mech_model *model, const mech_configuration *at, double *h);
 /* --- dynamics --- */
 
 /* Eq. 1: the acceleration dv'/dt, (MECH_N), and the multipliers, (MECH_ROWS), under the force u_tree, (MECH_N), on the
-   constraint manifold and off it, by elimination. Multipliers of redundant rows are zero. */
+   constraint manifold and off it, by elimination. */
 mech_status mech_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
                               const double *u_tree, double *acceleration, double *multipliers);
 
-/* Eq. 6: q_ddot under the motor torques tau, by elimination with pivoting. */
+/* The multipliers of an acceleration under the force u_tree. Those of redundant rows are zero. */
+void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                      const double *u_tree, const double *acceleration, double *multipliers);
+
+/* The force on the tree, (MECH_N), of motor torques tau. */
+void mech_motor_force(const double *tau, double *u_tree);
+
+/* Eq. 6: q_ddot under the force u_tree, by elimination with pivoting. */
 mech_status mech_forward_dynamics(const mech_model *model, const mech_configuration *at, const double *q_dot,
-                                  const double *tau, double *q_ddot);
+                                  const double *u_tree, double *q_ddot);
 
 /* The force u that q_ddot needs, eq. 6. */
 void mech_inverse_dynamics(const mech_model *model, const mech_configuration *at, const double *q_dot,
                            const double *q_ddot, double *u);
+
+/* Clip motor torques at the motors' limits. */
+void mech_limit_torques(double *tau);
 
 /* Motor torques of a force u, within the motors' limits; with redundant motors those of minimum norm. */
 mech_status mech_motor_torques(const mech_configuration *at, const double *u, double *tau);

@@ -22,6 +22,7 @@ static void compare_tree(const mech_model *model, const vector *x) {
   mech_configuration at;
   double D_tree[MECH_N * MECH_N], bias_tree[MECH_N], damping[MECH_N], h_tree[MECH_N], acceleration[MECH_N];
   double J_dot_v[MECH_SIZE(MECH_ROWS)], multipliers[MECH_SIZE(MECH_ROWS)];
+  double positions[MECH_SIZE(3 * MECH_POINTS)], velocities[MECH_SIZE(3 * MECH_POINTS)];
   if (mech_configure(model, x->q_tree, &at) != MECH_OK) largest[PHI] = HUGE_VAL;
   compare(PHI, x, at.phi, x->phi, MECH_ROWS);
   compare(J, x, at.J, x->J, MECH_ROWS * MECH_N);
@@ -33,6 +34,9 @@ static void compare_tree(const mech_model *model, const vector *x) {
   compare(DAMPING, x, damping, x->damping, MECH_N);
   mech_h_tree(model, &at, h_tree);
   compare(H_TREE, x, h_tree, x->h_tree, MECH_N);
+  mech_points(model, &at, x->v_tree, positions, velocities);
+  compare(POSITIONS, x, positions, x->positions, 3 * MECH_POINTS);
+  compare(VELOCITIES, x, velocities, x->velocities, 3 * MECH_POINTS);
   const double potential = mech_potential_energy(model, &at);
   compare(POTENTIAL, x, &potential, x->potential, 1);
   if (mech_acceleration(model, &at, x->v_tree, x->u_tree, acceleration, multipliers) != MECH_OK)
@@ -43,7 +47,8 @@ static void compare_tree(const mech_model *model, const vector *x) {
 
 static void compare_reduced(const mech_model *model, const vector *x) {
   mech_configuration at;
-  double D[MECH_D * MECH_D], C[MECH_D * MECH_D], h[MECH_D], u[MECH_D], q_ddot[MECH_D];
+  double D[MECH_D * MECH_D], C[MECH_D * MECH_D], h[MECH_D], u[MECH_D], u_tree[MECH_N], q_ddot[MECH_D];
+  double v_tree[MECH_N], acceleration[MECH_N];
   if (mech_configure(model, x->guess, &at) != MECH_OK || mech_sigma(model, x->q, &at) != MECH_OK)
     largest[SIGMA] = HUGE_VAL;
   compare(SIGMA, x, at.q_tree, x->sigma, MECH_NQ);
@@ -56,8 +61,12 @@ static void compare_reduced(const mech_model *model, const vector *x) {
   compare(H_REDUCED, x, h, x->h_reduced, MECH_D);
   mech_inverse_dynamics(model, &at, x->q_dot, x->q_ddot, u);
   compare(INVERSE, x, u, x->inverse, MECH_D);
-  if (mech_forward_dynamics(model, &at, x->q_dot, x->tau, q_ddot) != MECH_OK) largest[FORWARD] = HUGE_VAL;
+  mech_motor_force(x->tau, u_tree);
+  if (mech_forward_dynamics(model, &at, x->q_dot, u_tree, q_ddot) != MECH_OK) largest[FORWARD] = HUGE_VAL;
   compare(FORWARD, x, q_ddot, x->forward, MECH_D);
+  mech_velocity(&at, x->q_dot, v_tree);
+  mech_tree_acceleration(model, &at, v_tree, x->q_ddot, acceleration);
+  compare(TREE_ACCELERATION, x, acceleration, x->tree_acceleration, MECH_N);
 }
 
 static void compare_controllers(const mech_model *model, const vector *x) {
