@@ -165,7 +165,8 @@ def test_exported_acceleration_is_the_native_loops(name: str, folder_of: Callabl
         ours = c.acceleration(v, u)
         worst = max(worst, float(np.abs(ours - expected).max() / np.abs(expected).max()))
         tau, q_ddot = random.uniform(-1, 1, len(mechanism.motors.names)), np.zeros(c.d)
-        assert c.call("forward_dynamics", c.model, c.at, v[mechanism.partition.q].copy(), tau, q_ddot) == OK
+        c.call("motor_force", tau, u)
+        assert c.call("forward_dynamics", c.model, c.at, v[mechanism.partition.q].copy(), u, q_ddot) == OK
         expected = core.dae_acceleration(c.q_tree, v, mechanism.motors.force(tau), none)
         worst = max(worst, float(np.abs(q_ddot - expected[mechanism.partition.q]).max() / np.abs(expected).max()))
     assert worst <= EXACT
@@ -257,6 +258,16 @@ def make_mechanism(tmp_path: Path, old: str = "", new: str = "", extra: str = ""
         content = keyed.replace(old, new) if old else keyed
         (tmp_path / file).write_text(content + (extra if file == "mechanism.toml" else ""))
     return load(tmp_path)
+
+
+def test_coupled_joints_have_parameters_with_units(tmp_path: Path) -> None:
+    coupling = '\n[[coupling]]\njoint = "theta_3"\nother = "theta_1"\nratio = 1.5\noffset = 0.3\n'
+    mechanism = make_mechanism(tmp_path, 'independent = ["theta_1", "theta_3"]', 'independent = ["theta_1"]', coupling)
+    folder = tmp_path / "c"
+    write(export(mechanism, "c"), folder)
+    assert re.search(r"offset, rad \*/", (folder / "five_bar.h").read_text(encoding="ascii"))
+    run("gcc", *WARNINGS, "five_bar.c", "five_bar_test.c", "-lm", "-o", "vectors", cwd=folder)
+    run("./vectors", cwd=folder)
 
 
 def test_names_that_c_cannot_have_are_mapped_and_listed(tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 from zipfile import ZipFile
 
@@ -13,17 +16,21 @@ import numpy as np
 import pytest
 from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
+from scipy.integrate import solve_ivp
 
-from ckc_pin import InputError, Mechanism, Run, Scene, Simulator, load_scene, simulate
+from ckc_pin import InputError, Mechanism, Run, Scene, Simulator, load, load_scene, simulate
+from ckc_pin.base.arrays import Array
+from ckc_pin.codegen.arguments import argument_names, present, values
 from ckc_pin.formats.exporting import export, write
+from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.codegen.test_export_c import WARNINGS, make_mechanism, run
 from tests.contract.helpers.command import ckc
 
 EXACT = 1e-9  # relative to the largest value of a kind of quantities: co-simulation against `simulate`
 RTOL, SOLVER_TOLERANCE = 1e-11, 1e-9  # of our runs and of co-simulation; of FMPy's solver in model exchange
-# CVode controls the error of each step. Over two seconds of an undamped swing, these errors grow.
-MAX_MODEL_EXCHANGE_ERROR = 3e3 * SOLVER_TOLERANCE
+# CVode controls the error of each step, and these errors grow over a second of an undamped swing.
+MAX_MODEL_EXCHANGE_ERROR = 1e4 * SOLVER_TOLERANCE
 SCENES = {
     "five_bar": ("five_bar/swing", {}),
     "five_bar_spf": ("five_bar/swing", {"formulation": "spf", "epsilon": 1e-3}),
@@ -35,8 +42,8 @@ FMI = ["2.0", "3.0"]
 
 def scene_of(name: str) -> Scene:
     shipped, overrides = SCENES[name]
-    own = {"t_end": T_END, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT}
-    return load_scene(shipped, {**overrides, **own})
+    solver = {"t_end": T_END, "solver.rtol": RTOL, "solver.output_dt": OUTPUT_DT}
+    return load_scene(shipped, {**overrides, **solver})
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +59,9 @@ def fmu_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pat
 
 
 def simulate_fmu(path: Path, kind: str, outputs: list[str], **options: Any) -> Any:
-    own = {"relative_tolerance": RTOL} if kind == "CoSimulation" else {"relative_tolerance": SOLVER_TOLERANCE}
+    tolerance = {"relative_tolerance": RTOL} if kind == "CoSimulation" else {"relative_tolerance": SOLVER_TOLERANCE}
     return fmpy.simulate_fmu(
-        str(path), fmi_type=kind, stop_time=T_END, output_interval=OUTPUT_DT, output=outputs, **{**own, **options}
+        str(path), fmi_type=kind, stop_time=T_END, output_interval=OUTPUT_DT, output=outputs, **{**tolerance, **options}
     )
 
 
@@ -76,8 +83,8 @@ def largest_difference(mechanism: Mechanism, ours: Run, theirs: Any) -> float:
     differences = []
     for names in kinds_of_outputs(mechanism).values():
         expected = np.array([ours[name] for name in names])
-        found = np.array([theirs[name] for name in names])
-        differences.append(np.abs(found - expected).max() / np.abs(expected).max())
+        actual = np.array([theirs[name] for name in names])
+        differences.append(np.abs(actual - expected).max() / np.abs(expected).max())
     return float(max(differences))
 
 
@@ -100,6 +107,34 @@ def test_fmu_moves_as_the_run_does(name: str, fmi: str, kind: str, fmu_of: Calla
     assert theirs["phi.max"].max() <= (10 * SOLVER_TOLERANCE if is_spf else 1e-12)
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_derivatives_of_model_exchange_are_those_of_the_run(name: str, fmu_of: Callable[[str, str], Path]) -> None:
+    """SciPy integrates the FMU's derivatives more accurately than CVode does."""
+    fmu, scene = instantiate(fmu_of(name, "2.0"), kind="ModelExchange"), scene_of(name)
+    fmu.enterContinuousTimeMode()
+    structure = fmu.description.derivatives
+    start = np.zeros(len(structure))
+    fmu.getContinuousStates(pointer_to(start), len(start))
+
+    def differentiate(t: float, states: Array) -> Array:
+        x, rates = np.array(states), np.zeros(len(states))
+        fmu.setTime(t)
+        fmu.setContinuousStates(pointer_to(x), len(x))
+        fmu.getDerivatives(pointer_to(rates), len(x))
+        return rates
+
+    ours = simulate(scene)
+    solution = solve_ivp(differentiate, (0.0, T_END), start, "DOP853", t_eval=ours.t, rtol=1e-12, atol=1e-13)
+    for state, actual in zip([x.variable.derivative.name for x in structure], solution.y, strict=True):
+        expected = ours[state]
+        assert np.abs(actual - expected).max() <= EXACT * max(1.0, np.abs(expected).max())
+    fmu.freeInstance()
+
+
+def pointer_to(numbers: Array) -> Any:
+    return numbers.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+
 def test_motor_torques_are_inputs(fmu_of: Callable[[str, str], Path]) -> None:
     """The reference is a simulator that gets the same torques, constant in each step."""
     simulator, count = Simulator(scene_of("five_bar")), round(T_END / OUTPUT_DT)
@@ -112,18 +147,20 @@ def test_motor_torques_are_inputs(fmu_of: Callable[[str, str], Path]) -> None:
     for k in range(count):
         fmu.setReal(places, tau[:, k].tolist())
         fmu.doStep(OUTPUT_DT * k, OUTPUT_DT)
-        found = fmu.getReal([reference[name] for name in ("theta_1", "theta_2", "v.theta_1", "v.theta_3")])
+        actual = fmu.getReal([reference[name] for name in ("theta_1", "theta_2", "v.theta_1", "v.theta_3")])
         expected = [*states[k].q_tree[:2], *states[k].q_dot]
-        np.testing.assert_allclose(found, expected, rtol=0, atol=EXACT * 5)
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=EXACT * 5)
     fmu.terminate()
     fmu.freeInstance()
 
 
-def instantiate(path: Path, values: dict[str, float] | None = None, guid: str | None = None) -> Any:
-    """Return an FMU 2.0 for co-simulation after its initialization, with start values."""
-    folder = fmpy.extract(str(path), str(path.parent / f"unzipped-{path.stem}"))
+def instantiate(
+    path: Path, values: dict[str, float] | None = None, guid: str | None = None, kind: str = "CoSimulation"
+) -> Any:
+    """Return an FMU 2.0 after its initialization, with start values."""
+    folder = fmpy.extract(str(path), mkdtemp(dir=path.parent))  # a library must not be overwritten while it is loaded
     description = fmpy.read_model_description(folder)
-    fmu = fmpy.fmi2.FMU2Slave(
+    fmu = (fmpy.fmi2.FMU2Slave if kind == "CoSimulation" else fmpy.fmi2.FMU2Model)(
         guid=guid or description.guid,
         unzipDirectory=folder,
         modelIdentifier=description.coSimulation.modelIdentifier,
@@ -157,9 +194,6 @@ def test_parameters_and_start_values_can_be_set(fmi: str, fmu_of: Callable[[str,
 
 def link_numbers(scene: Scene) -> dict[str, float]:
     """Return the parameters of exported code that belong to a link."""
-    from ckc_pin.codegen.arguments import argument_names, present, values
-    from ckc_pin.mechanism.parameter_map import model_numbers
-
     mechanism = load_scene_mechanism(scene)
     numbers = model_numbers(mechanism)
     which = present(numbers)
@@ -199,7 +233,7 @@ def test_other_model_descriptions_are_refused(fmu_of: Callable[[str, str], Path]
 def test_sources_compile_with_the_standards_headers(
     name: str, fmi: str, fmu_of: Callable[[str, str], Path], tmp_path: Path
 ) -> None:
-    """The headers check the type of each function. Undefined behaviour would be found by the compiler's analysis."""
+    """The headers check the type of each function, and say which functions there must be."""
     with ZipFile(fmu_of(name, fmi)) as archive:
         archive.extractall(tmp_path)
     headers = Path(fmpy.__file__).parent / "c-code"
@@ -215,8 +249,6 @@ def test_sources_compile_with_the_standards_headers(
 
 def fmi_functions(header: str, fmi: str) -> list[str]:
     """Return the functions that a header declares."""
-    import re
-
     return re.findall(rf"FMI{fmi[0]}_Export fmi{fmi[0]}\w+TYPE\s+(fmi{fmi[0]}\w+);", header)
 
 
@@ -226,11 +258,11 @@ def test_the_same_scene_gives_the_same_file() -> None:
 
 
 def test_names_that_are_no_identifiers_are_kept_in_flat_names(tmp_path: Path) -> None:
-    make_mechanism(tmp_path, "theta_1", "théta-1 <&>")
+    make_mechanism(tmp_path, "theta_1", "théta-1 (links)")
     scene = Scene(tmp_path, t_end=1.0)
     (path,) = write(export(scene, "fmu"), tmp_path / "fmu")
     assert validate_fmu(str(path)) == []
-    assert "v.théta-1 <&>" in [x.name for x in fmpy.read_model_description(str(path)).modelVariables]
+    assert "v.théta-1 (links)" in [x.name for x in fmpy.read_model_description(str(path)).modelVariables]
 
 
 def test_without_a_compiler_the_fmu_has_sources_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,7 +279,9 @@ REFUSED = {
     "sampled": ("five_bar", {"controller.sample_time": 0.01}, "a sampled controller is not exported"),
     "stops": ("five_bar/friction", {"controller": None}, "stops of theta_1, theta_3 are not supported"),
     "forces": (
-        "five_bar/swing", {"force": [{"frame": "link_2", "force": [1.0, 0.0, 0.0]}]}, "forces on links .link_2. are not",
+        "five_bar/swing",
+        {"force": [{"frame": "link_2", "force": [1.0, 0.0, 0.0]}]},
+        "forces on links .link_2. are not",
     ),
     "w": ("five_bar/swing", {"formulation": "spf", "initial.w": [1e-3, 0.0]}, "initial.w: an FMU starts with closed"),
     "free root": ("delta", {"formulation": "spf"}, 'not supported for free roots.*set formulation = "reduced"'),
@@ -265,19 +299,11 @@ def test_export_refuses_friction_prescribed_joints_and_other_versions(tmp_path: 
     rough = make_mechanism(tmp_path, extra='\n[[joint]]\nname = "theta_2"\nfriction = 0.1\n')
     with pytest.raises(InputError, match=r"export to fmu: dry friction of theta_2 .* set friction = 0"):
         export(Scene(rough, t_end=1.0), "fmu")
-    moved = Scene(
-        "four_bar",
-        t_end=1.0,
-        prescribed=[{"joint": load_scene_mechanism(scene_of_four_bar()).independent[0], "rate": 1.0}],
-    )
+    moved = Scene("four_bar", t_end=1.0, prescribed=[{"joint": load("four_bar").independent[0], "rate": 1.0}])
     with pytest.raises(InputError, match="prescribed joints are not supported"):
         export(moved, "fmu")
     with pytest.raises(InputError, match=r"fmi = '1.0': expected one of 2.0, 3.0"):
         export(scene_of("five_bar"), "fmu", fmi="1.0")
-
-
-def scene_of_four_bar() -> Scene:
-    return Scene("four_bar", t_end=1.0)
 
 
 def test_command_writes_an_fmu(tmp_path: Path) -> None:

@@ -26,8 +26,8 @@ QUANTITIES = {
     "J_dot_v": "MECH_ROWS", "damping": "MECH_N", "h_tree": "MECH_N", "potential": "1", "acceleration": "MECH_N",
     "multipliers": "MECH_ROWS", "sigma": "MECH_NQ", "rho": "MECH_N * MECH_D", "D_reduced": "MECH_D * MECH_D",
     "C_reduced": "MECH_D * MECH_D", "h_reduced": "MECH_D", "inverse": "MECH_D", "forward": "MECH_D",
-    "tree_acceleration": "MECH_N", "positions": "3 * MECH_POINTS", "velocities": "3 * MECH_POINTS", "set_point": "MECH_D",
-    "set_point_tau": "MECH_MOTORS", "tracking": "MECH_D",
+    "tree_acceleration": "MECH_N", "positions": "3 * MECH_POINTS", "velocities": "3 * MECH_POINTS",
+    "set_point": "MECH_D", "set_point_tau": "MECH_MOTORS", "tracking": "MECH_D",
 }  # fmt: skip
 INPUTS = {
     "q_tree": "MECH_NQ", "v_tree": "MECH_N", "u_tree": "MECH_N", "guess": "MECH_NQ", "q": "MECH_D", "q_dot": "MECH_D",

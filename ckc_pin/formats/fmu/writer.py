@@ -113,7 +113,7 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
         raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it")
     if spec.formulation == "spf" and mechanism.tree.free_roots:
         raise InputError(
-            f"{where}: model exchange by the SPF is not supported for free roots, whose quaternions must keep length 1; "
+            f"{where}: model exchange by the SPF is not supported for free roots, whose quaternions need length 1; "
             'set formulation = "reduced" (--set formulation=reduced)'
         )
 
