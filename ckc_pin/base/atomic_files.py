@@ -55,10 +55,10 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Write a text atomically, as UTF-8. Raises as `open_atomic` does."""
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Write bytes, or a text as UTF-8, atomically. Raises as `open_atomic` does."""
     with open_atomic(path) as file:
-        file.write(text.encode())
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 @contextmanager

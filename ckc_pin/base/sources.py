@@ -20,7 +20,7 @@ __all__ = [
     "Sources",
     "parse_xml",
     "resolve_path",
-    "write_texts",
+    "write_files",
 ]
 
 PACKAGE = "package://"
@@ -110,24 +110,24 @@ def resolve_path(file: str, folder: Path, where: str) -> Path:
                      "pip install example-robot-data")  # fmt: skip
 
 
-def write_texts(folder: Path, texts: Mapping[str, str], overwrite: bool) -> list[Path]:
-    """Write texts by file name into a folder, which is created if it does not exist. Return their paths.
+def write_files(folder: Path, files: Mapping[str, str | bytes], overwrite: bool) -> list[Path]:
+    """Write contents by file name into a folder, which is created if it does not exist. Return their paths.
 
     Raises
     ------
     InputError
         A file exists and `overwrite` is False, or the folder cannot be written to.
     """
-    existing = [str(folder / file) for file in texts if lexists(folder / file)]
+    existing = [str(folder / file) for file in files if lexists(folder / file)]
     if existing and not overwrite:
         raise InputError(f"{' and '.join(existing)}: there already; write elsewhere with --out DIR, or say --overwrite")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
-    for file, text in texts.items():
-        write_atomic(folder / file, text)
-    return [folder / file for file in texts]
+    for file, content in files.items():
+        write_atomic(folder / file, content)
+    return [folder / file for file in files]
 
 
 def _share_folders() -> list[Path]:

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -116,28 +116,48 @@ def import_(file: Path, repair: bool, out: Path | None, overwrite: bool, as_json
 
 @click.command(
     epilog=options.format_examples(
-        "ckc export five_bar --to mjcf > five_bar.xml", "ckc export mine --to mjcf --out models"
+        "ckc export five_bar --to mjcf > five_bar.xml",
+        "ckc export mine --to mjcf --out models",
+        "ckc export five_bar --to c --out controller",
+        "ckc export five_bar/swing --to fmu --out units",
     )
 )
-@options.mechanism
+@click.argument(
+    "model",
+    metavar="MECHANISM",
+    shell_complete=options.complete_scenes,
+    help="A shipped name, a folder or a file. With --to fmu, a scene.",
+)
 @click.option(
     "--to",
-    type=click.Choice(["mjcf", "urdf", "sdf"]),
+    type=click.Choice(["mjcf", "urdf", "sdf", "c", "fmu"]),
     default="mjcf",
-    help="mjcf: for MuJoCo; urdf: a tree with <loop> elements; sdf: for Gazebo, with loops as joints.",
+    help="mjcf: for MuJoCo; urdf: a tree with <loop> elements; sdf: for Gazebo, with loops as joints; c: C99 of the "
+    "dynamics and the controllers, for the computer of a robot; fmu: for Simulink, Dymola, OpenModelica and others.",
 )
+@click.option("--fmi", type=click.Choice(["2.0", "3.0"]), help="With --to fmu: version of the standard; default 2.0.")
+@options.overrides
 @options.out(help="Folder to write to; without it the model is printed.")
 @options.overwrite
 @options.as_json
-def export(mechanism: str, to: str, out: Path | None, overwrite: bool, as_json: bool) -> None:
-    """Convert a mechanism for another program. Lists how its motion differs there."""
+def export(
+    model: str, to: str, fmi: str | None, overrides: dict[str, Any], out: Path | None, overwrite: bool, as_json: bool
+) -> None:
+    """Convert a mechanism or a scene for another program. Lists how its motion differs there."""
     from ckc_pin.formats import exporting
 
-    with Spinner(f"export of {mechanism}"):
-        loaded = ckc_pin.load(mechanism)
-        is_measured = to == "mjcf" and find_spec("mujoco") is not None
-        exported = _export_to_mujoco(loaded) if is_measured else exporting.export(loaded, to)
-    paths = [] if out is None else [exporting.write(exported, out, overwrite)]
+    if to in ("c", "fmu") and out is None:
+        raise InputError(f"export: --to {to} does not write a text that can be printed; give a folder as --out DIR")
+    if fmi and to != "fmu":
+        raise InputError("export: --fmi is an option of --to fmu; leave it out")
+    with Spinner(f"export of {model}"):
+        if to == "fmu":
+            exported = exporting.export(ckc_pin.load_scene(model, overrides), to, fmi=fmi or "2.0")
+        else:
+            mechanism = ckc_pin.load(model, overrides or None)
+            is_measured = to == "mjcf" and find_spec("mujoco") is not None
+            exported = _export_to_mujoco(mechanism) if is_measured else exporting.export(mechanism, to)
+    paths = [] if out is None else exporting.write(exported, out, overwrite)
     if as_json:
         text = {} if paths else {"text": exported.text}
         written = [str(path) for path in paths]

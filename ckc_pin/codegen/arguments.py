@@ -10,8 +10,9 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import list_line_springs, list_loop_frames, list_spring_ends
+from ckc_pin.mechanism.units import ROTOR, STIFF, VISCOUS, effort, row_units
 
-__all__ = ["Arguments", "argument_names", "constant", "present", "snap_to_units", "values"]
+__all__ = ["Arguments", "argument_names", "argument_units", "constant", "present", "snap_to_units", "values"]
 
 NEGLIGIBLE = 1e-14  # numbers closer than this to 0, 1 or -1 are replaced by it
 
@@ -60,6 +61,31 @@ def argument_names(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list
         "damping": lambda k: f"spring.{lines[k]}.damping",
     }
     return [by_kind[kind](*index) for kind, present in which.items() for index in np.argwhere(present).tolist()]
+
+
+def argument_units(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> list[str]:
+    """Return the units of the arguments, in the order of `Arguments.vector`; "" if dimensionless."""
+    units, rows = mechanism.tree.units(), row_units(mechanism)
+    by_kind: dict[str, Callable[..., str]] = {
+        "gravity": lambda k: "m/s²",
+        "mass": lambda j: "kg",
+        "inertia": lambda j, k, m: "kg m²",
+        "armature": lambda k: ROTOR[units[k]],
+        "rotors": lambda k, j: ROTOR[units[k]] if units[k] == units[j] else "kg m",
+        "affine": lambda row, k: "" if rows[row] == units[k] else f"{rows[row]}/{units[k]}",
+        "affine_offset": lambda row: rows[row],
+        "constant": lambda k: effort(units[k]),
+        "joint_stiffness": lambda k: STIFF[units[k]],
+        "joint_rest": lambda k: units[k],
+        "joint_damping": lambda k: VISCOUS[units[k]],
+        "stiffness": lambda k: STIFF["m"],
+        "damping": lambda k: VISCOUS["m"],
+    }
+    return [
+        by_kind[kind](*index) if kind in by_kind else "m"  # the others are lengths
+        for kind, present in which.items()
+        for index in np.argwhere(present).tolist()
+    ]
 
 
 class Arguments:

@@ -8,6 +8,7 @@ A result that is NaN marks an unused place of the result: no value of its own is
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from math import isnan
@@ -17,7 +18,7 @@ from ckc_pin.codegen.graph import Graph, Lane, Packing
 
 __all__ = [
     "MEMBERS", "LaneMap", "count_operations", "count_statements", "split_column", "trace_result_lanes",
-    "write_c_source",
+    "write_c_source", "write_static_function",
 ]  # fmt: skip
 
 LaneMap = Mapping[str, Mapping[int, tuple[Lane, int]]]  # by argument and place: the lane, and the shared number
@@ -57,8 +58,8 @@ def _operation_formats() -> tuple[dict[int, str], dict[int, str]]:
     scalar = {
         cs.OP_ASSIGN: "{0}", cs.OP_SQRT: "sqrt({0})", cs.OP_SIN: "sin({0})", cs.OP_COS: "cos({0})",
         cs.OP_TAN: "tan({0})", cs.OP_ATAN2: "atan2({0},{1})", cs.OP_FABS: "fabs({0})", cs.OP_LT: "{0}<{1}",
-        cs.OP_LE: "{0}<={1}", cs.OP_EQ: "{0}=={1}", cs.OP_NE: "{0}!={1}", cs.OP_NOT: "!{0}",
-        cs.OP_AND: "{0}&&{1}", cs.OP_OR: "{0}||{1}", cs.OP_IF_ELSE_ZERO: "{0}?{1}:0",
+        cs.OP_LE: "{0}<={1}", cs.OP_EQ: "{0}=={1}", cs.OP_NE: "{0}!={1}", cs.OP_NOT: "{0}==0",
+        cs.OP_AND: "{0}!=0&&{1}!=0", cs.OP_OR: "{0}!=0||{1}!=0", cs.OP_IF_ELSE_ZERO: "{0}!=0?{1}:0",
         cs.OP_FMIN: "fmin({0},{1})", cs.OP_FMAX: "fmax({0},{1})",
     }  # fmt: skip
     return both | scalar, {**both, cs.OP_LT: "({2})(({0}<{1})&({2}_bits){2}_ones)"}
@@ -79,6 +80,11 @@ def write_c_source(functions: Sequence[Any], lanes: LaneMap, of_members: Sequenc
     texts = [_FunctionWriter(function, lanes).write() for function in functions]
     texts += [HEAD_OF_MEMBERS + _MembersWriter(function, {}).write() for function in of_members]
     return HEAD + "".join(texts)
+
+
+def write_static_function(function: Any, name: str) -> str:
+    """Return a CasADi function as a static function of portable C99: pointers to its arguments, then to its results."""
+    return _FunctionWriter(function, {}).write_static(name)
 
 
 def trace_result_lanes(function: Any, result: str, lanes: LaneMap) -> dict[int, tuple[Lane, int]]:
@@ -154,6 +160,16 @@ class _FunctionWriter:
             *_size_functions(f"{name}_%s_out", [self._size(f.size_out(k)) for k in range(f.n_out())]),
         ]
         return "\n".join([head, *self.lines, "return 0;", "}", *sizes, ""])
+
+    def write_static(self, name: str) -> str:
+        """Return the function in C99, without the vectors that only GCC and Clang have."""
+        self._write_results()
+        inputs = [f"x{k}" for k in range(self.function.n_in())]
+        outputs = [f"y{k}" for k in range(self.function.n_out())]
+        text = "\n".join(self.lines)
+        unused = [f"(void){x};" for x in (*inputs, *outputs) if not re.search(rf"\b{x}\[", text)]
+        parameters = [*(f"const double *restrict {x}" for x in inputs), *(f"double *restrict {y}" for y in outputs)]
+        return "\n".join([f"static void {name}({', '.join(parameters)}) {{", *unused, *self.lines, "}", ""])
 
     def _size(self, shape: tuple[int, int]) -> tuple[int, int]:
         return shape if self.columns == 1 else (self.columns, shape[0] * shape[1])

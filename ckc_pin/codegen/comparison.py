@@ -19,7 +19,14 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["CompiledFunctions", "require_equal_terms"]
+__all__ = [
+    "TERMS_TOLERANCE",
+    "CompiledFunctions",
+    "reference_acceleration",
+    "reference_terms",
+    "require_equal_terms",
+    "sample_configurations",
+]
 
 STATES = 25  # compared on the constraint manifold, and as many off it
 STATE_SPREAD = 0.5  # rad, or times the mechanism's size: distance of the states from the assembled configuration
@@ -111,7 +118,7 @@ def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
     """
     functions, random = CompiledFunctions(library), np.random.default_rng(0)
     compared, order = 0, elimination_order(mechanism, mechanism.independent_rows)
-    for at, is_closed in _sample_configurations(mechanism, random):
+    for at, is_closed in sample_configurations(mechanism, random):
         v = random.uniform(-2, 2, mechanism.n) * mechanism.tree.step_scale
         if is_closed and mechanism.closure.rows:
             v = v - np.linalg.pinv(at.J, rcond=1e-9) @ (at.J @ v)
@@ -133,40 +140,44 @@ def require_equal_terms(mechanism: Mechanism, library: Library) -> None:
 
 
 def _compare_terms(terms: Terms, functions: CompiledFunctions, x: Array) -> None:
-    mechanism, at, q, v = terms.mechanism, terms.at, terms.q_tree, terms.v_tree
+    mechanism, q, v = terms.mechanism, terms.q_tree, terms.v_tree
     ours = dict(zip(("phi", "J"), functions.call("place", q), strict=True))
     ours["D_tree"] = functions.call("inertia", q)[0]
     ours |= zip(("bias_tree", "J_dot_v", "damping"), functions.call("bias", q, v), strict=True)
     ours["J_dot"] = functions.call("jacobian_rate", q, v)[0]
     ours["h_tree"] = functions.call("rest", q)[0]
     ours["potential"] = functions.call("potential_energy", q)[0]
-    D = np.triu(terms.D_tree)
-    reference = {
-        "phi": at.phi, "J": at.J, "D_tree": D + np.triu(D, 1).T, "bias_tree": terms.bias_tree,
-        "J_dot_v": terms.J_dot @ v, "damping": terms.damping_force, "J_dot": terms.J_dot, "h_tree": terms.h_tree,
-        "potential": np.array([terms.potential_energy]),
-    }  # fmt: skip
+    reference = reference_terms(terms)
     if "coriolis" in functions:
-        ours["C' x"], reference["C' x"] = functions.call("coriolis", q, v, x)[0], terms.C_tree @ x
+        scale = float(np.abs(terms.D_tree).max()) * float(np.abs(v).max())
+        ours["C' x"], reference["C' x"] = functions.call("coriolis", q, v, x)[0], (terms.C_tree @ x, scale)
+    for name, (expected, scale) in reference.items():
+        _require_equal(mechanism, name, ours[name], np.ravel(expected, order="F"), scale)
+
+
+def reference_terms(terms: Terms) -> dict[str, tuple[Array, float]]:
+    """Return the terms of Pinocchio and of the constraint rows by name, with the size of summands that may cancel."""
+    mechanism, at, v = terms.mechanism, terms.at, terms.v_tree
+    D = np.triu(terms.D_tree)
     speed, J = float(np.abs(v).max()), float(np.abs(at.J).max(initial=0.0))
-    scale = {  # sizes of the summands, which a sum may cancel
-        "phi": mechanism.size, "J_dot": J * speed, "J_dot_v": J * speed**2, "bias_tree": float(D.max()) * speed**2,
-        "C' x": float(D.max()) * speed, "potential": float(np.abs(terms.h_tree).max()) * max(1.0, mechanism.size),
-    }  # fmt: skip
-    for name, expected in reference.items():
-        _require_equal(mechanism, name, ours[name], np.ravel(expected, order="F"), scale.get(name, 0.0))
+    return {
+        "phi": (at.phi, mechanism.size),
+        "J": (at.J, 0.0),
+        "D_tree": (D + np.triu(D, 1).T, 0.0),
+        "bias_tree": (terms.bias_tree, float(D.max()) * speed**2),
+        "J_dot_v": (terms.J_dot @ v, J * speed**2),
+        "damping": (terms.damping_force, 0.0),
+        "J_dot": (terms.J_dot, J * speed),
+        "h_tree": (terms.h_tree, 0.0),
+        "potential": (np.array([terms.potential_energy]), float(np.abs(terms.h_tree).max()) * max(1.0, mechanism.size)),
+    }
 
 
 def _compare_solutions(terms: Terms, functions: CompiledFunctions, order: Sequence[int], u: Array, x: Array) -> bool:
     """Compare solutions of eq. 1, its derivatives and the closing step; return False where they would lose digits."""
     mechanism, at, q, v = terms.mechanism, terms.at, terms.q_tree, terms.v_tree
-    if not _is_well_conditioned(terms, order):
-        return False
-    try:
-        acceleration = dae_acceleration(terms, u)
-    except NumericalError:
-        return False
-    if _cancels(terms, u, acceleration):
+    acceleration = reference_acceleration(terms, order, u)
+    if acceleration is None:
         return False
     ours = functions.call("acceleration", q, v, u, np.zeros(len(at.phi)))[0]
     _require_equal(mechanism, "acceleration", ours, acceleration)
@@ -176,6 +187,17 @@ def _compare_solutions(terms: Terms, functions: CompiledFunctions, order: Sequen
     if "jacobian" in functions:
         _compare_derivatives(mechanism, functions, q, v, u)
     return True
+
+
+def reference_acceleration(terms: Terms, order: Sequence[int], u: Array) -> Array | None:
+    """Return eq. 1's acceleration under the force u', or None where elimination in an order would lose digits."""
+    if not _is_well_conditioned(terms, order):
+        return None
+    try:
+        acceleration = dae_acceleration(terms, u)
+    except NumericalError:
+        return None
+    return None if _cancels(terms, u, acceleration) else acceleration
 
 
 def _regular_system(terms: Terms) -> tuple[Array, Array]:
@@ -297,7 +319,7 @@ def _compare_directional_derivatives(
         _require_equal(mechanism, "the acceleration's changes", together, np.ravel(derivatives, order="F"))
 
 
-def _sample_configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:
+def sample_configurations(mechanism: Mechanism, random: np.random.Generator) -> Iterator[tuple[Kinematics, bool]]:
     """Yield configurations, and whether their loops are closed."""
     tree = mechanism.tree
     yield mechanism.assembled, True

@@ -52,6 +52,8 @@ class TermExpressions:
         Elimination order of [D', J^T; J, 0]: coordinates, and kept rows from n on.
     kinetic, potential : casadi.SX
         Energies, J. `potential` is of gravity, springs and constant forces.
+    points : casadi.SX, casadi.SX
+        Positions and velocities of the named points in the world, each a column of 3 per point.
     """
 
     configuration: ConfigurationSymbols
@@ -70,6 +72,7 @@ class TermExpressions:
     order: tuple[int, ...]
     kinetic: Any
     potential: Any
+    points: tuple[Any, Any]
 
 
 def term_expressions(
@@ -117,7 +120,21 @@ def term_expressions(
         order=elimination_order(mechanism, kept),
         kinetic=dot(v, multiply(D_tree, v)) / 2,
         potential=potential + stored,
+        points=_points(mechanism, bodies),
     )
+
+
+def _points(mechanism: Mechanism, bodies: list[MovingBody]) -> tuple[Any, Any]:
+    import casadi as cs
+
+    positions, velocities = cs.SX(0, 1), cs.SX(0, 1)
+    for place in mechanism.points.values():
+        body = bodies[place.joint]
+        to_world = body.axes.rotation_to(bodies[0].axes)
+        position, velocity, _ = body.point(cs.SX(place.translation))
+        positions = cs.vertcat(positions, multiply(to_world, position))
+        velocities = cs.vertcat(velocities, multiply(to_world, velocity))
+    return positions, velocities
 
 
 def _inertia(

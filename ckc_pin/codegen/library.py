@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,7 +30,17 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.rows import Curved, RelativeLog
 
-__all__ = ["Library", "cache_folder", "compile_terms", "explain_too_large", "find_compiled_terms"]
+if TYPE_CHECKING:
+    from ckc_pin.codegen.term_functions import TermFunctions
+
+__all__ = [
+    "Library",
+    "cache_folder",
+    "compile_terms",
+    "derive_term_functions",
+    "explain_too_large",
+    "find_compiled_terms",
+]
 
 COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, measured in docs/theory/generated.md
 # Limits of the size of a tree, so that the compiler takes at most two minutes. The second one limits the
@@ -262,7 +273,12 @@ def _make(
         raise InputError(f"compiled terms cannot be loaded: neither {folders[0]} nor {folders[1]} allows programs")
     with temporary_folder(place) as folder:
         source, library = folder / "terms.c", folder / "terms.so"
-        text = _write_c_source(mechanism, subject)
+        text = derive_term_functions(
+            mechanism,
+            subject.which,
+            directional_derivatives=subject.directional_derivatives,
+            of_members=subject.of_members,
+        ).c_source()
         if on_written is not None:
             on_written(len(text) * COMPILE_S_PER_CHARACTER)
         try:
@@ -276,16 +292,27 @@ def _make(
         return Library(str(_store(name, content)), subject.parameters)
 
 
-def _write_c_source(mechanism: Mechanism, subject: _Subject) -> str:
+def derive_term_functions(
+    mechanism: Mechanism,
+    which: Mapping[str, BoolArray] | None = None,
+    *,
+    directional_derivatives: bool = False,
+    of_members: bool = False,
+    portable: bool = False,
+) -> TermFunctions:
+    """Derive a mechanism's term functions, arguments as in `TermFunctions.of`.
+
+    Raises
+    ------
+    InputError
+        CasADi is not installed.
+    """
     try:
         from ckc_pin.codegen.term_functions import TermFunctions
 
         return TermFunctions.of(
-            mechanism,
-            subject.which,
-            directional_derivatives=subject.directional_derivatives,
-            of_members=subject.of_members,
-        ).c_source()
+            mechanism, which, directional_derivatives=directional_derivatives, of_members=of_members, portable=portable
+        )
     except ModuleNotFoundError as error:
         message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"
         raise InputError(message) from error

@@ -14,7 +14,7 @@ from ckc_pin.codegen.derivatives import derivative_functions
 from ckc_pin.codegen.expressions import TermExpressions, term_expressions
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["FUNCTIONS", "TermFunctions"]
+__all__ = ["FUNCTIONS", "PORTABLE_FUNCTIONS", "TermFunctions"]
 
 # By name of the C function: arguments and results. Matrices are dense, by columns. After q, each function takes the
 # cosines and sines of its entries; the last argument is the result of `numbers`.
@@ -30,6 +30,11 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
+# Of exported C. `bilinear` is the polarization of the terms that are quadratic in v': symmetric in v and x, and for
+# x = v equal to C' v' and J_dot v'. Projected by rho^T, it gives C x of eq. 6 for trees with and without a free root.
+PORTABLE_FUNCTIONS = {
+    name: FUNCTIONS[name] for name in ("place", "inertia", "bias", "rest", "potential_energy", "acceleration")
+} | {"bilinear": (("q", "v", "x"), ("bias_x", "J_dot_x")), "points": (("q", "v"), ("positions", "velocities"))}
 # Limit of (operations of the acceleration) * n, about twice the operations of its derivatives. `jacobian` is left out
 # above it.
 MAX_JACOBIAN_OPERATIONS = 3e4
@@ -76,6 +81,7 @@ class TermFunctions:
         *,
         directional_derivatives: bool = False,
         of_members: bool = False,
+        portable: bool = False,
     ) -> TermFunctions:
         """Derive a mechanism's functions.
 
@@ -88,11 +94,14 @@ class TermFunctions:
             Whether to add directional derivatives.
         of_members : bool
             Whether to add the acceleration of several members at a time.
+        portable : bool
+            Whether to derive `PORTABLE_FUNCTIONS`, for code without vectors of identical branches.
         """
         import casadi as cs
 
         lanes = dict(find_identical_branches(mechanism.tree))
-        terms = term_expressions(mechanism, which, group_roots(mechanism.tree, lanes))
+        terms = term_expressions(mechanism, which, () if portable else group_roots(mechanism.tree, lanes))
+        table = PORTABLE_FUNCTIONS if portable else FUNCTIONS
         symbols = {
             "q": terms.configuration.q,
             "trig": terms.configuration.trig,
@@ -108,10 +117,10 @@ class TermFunctions:
             "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
             "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
         }
-        results = _results(terms, symbols, direction if directional_derivatives else None)
+        results = _results(terms, symbols, direction if directional_derivatives else None, portable)
         column, numbers, functions, lanes["numbers"] = _extract_numbers(mechanism, terms, results, lanes)
         parts = dict(zip(results, split_column(column, [x.numel() for x in results.values()]), strict=True))
-        for name, (arguments, outputs) in FUNCTIONS.items():
+        for name, (arguments, outputs) in table.items():
             if not parts.keys() >= {*outputs}:
                 continue
             inputs = {x: symbols[x] for x in ("q", "trig", *arguments[1:])} | {"numbers": numbers}
@@ -157,13 +166,14 @@ def _extract_numbers(
     return column, cs.vertcat(all_numbers, *extracted), functions, number_lanes
 
 
-def _results(terms: TermExpressions, symbols: dict[str, Any], direction: dict[str, Any] | None) -> dict[str, Any]:
+def _results(
+    terms: TermExpressions, symbols: dict[str, Any], direction: dict[str, Any] | None, portable: bool
+) -> dict[str, Any]:
     import casadi as cs
 
     rows = terms.rows
     inertia = ConstrainedInertia(terms)
     acceleration, _ = inertia.acceleration(symbols["u"], symbols["correction"])
-    J_dot = terms.configuration.directional_derivative(cs.vec(rows.J), terms.q_dot)
     results = {
         "phi": rows.phi,
         "J": rows.J,
@@ -171,13 +181,20 @@ def _results(terms: TermExpressions, symbols: dict[str, Any], direction: dict[st
         "bias_tree": terms.bias_tree,
         "J_dot_v": rows.J_dot_v,
         "damping": terms.damping,
-        "J_dot": cs.reshape(J_dot, rows.J.shape),
         "h_tree": cs.substitute(terms.bias_tree, terms.v, cs.DM.zeros(terms.v.numel())),
         "potential": terms.potential,
         "acceleration": acceleration,
         "sound": inertia.accuracy(),
-        "step": inertia.closing_step(symbols["residual"]),
     }
+    if portable:
+        velocity_terms = cs.vertcat(terms.bias_tree, rows.J_dot_v)
+        bilinear = cs.jtimes(velocity_terms, terms.v, symbols["x"]) / 2
+        results["positions"], results["velocities"] = terms.points
+        results["bias_x"], results["J_dot_x"] = split_column(bilinear, [terms.v.numel(), rows.phi.numel()])
+        return {name: cs.densify(x) for name, x in results.items()}
+    J_dot = terms.configuration.directional_derivative(cs.vec(rows.J), terms.q_dot)
+    results["J_dot"] = cs.reshape(J_dot, rows.J.shape)
+    results["step"] = inertia.closing_step(symbols["residual"])
     if not terms.quaternions:  # Christoffel symbols: the bias is quadratic in v'
         results["C_x"] = cs.jtimes(terms.bias_tree, terms.v, symbols["x"]) / 2
     if cs.n_nodes(acceleration) * terms.v.numel() < MAX_JACOBIAN_OPERATIONS:

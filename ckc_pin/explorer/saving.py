@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.sources import write_texts
+from ckc_pin.base.sources import write_files
 from ckc_pin.base.toml_writer import to_toml_value, write_toml
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.configuration import Kinematics
@@ -130,7 +130,7 @@ def write_new_texts(folder: str | Path, texts: Mapping[str, str]) -> None:
             raise InputError(f"{path}: there already, with other contents; choose another name")
         if not is_same:
             new[file] = text
-    write_texts(folder, new, overwrite=True)
+    write_files(folder, new, overwrite=True)
 
 
 def save_scene(folder: str | Path, name: str, mechanism: Mechanism, scene: Scene | None, at: Kinematics) -> Path:

@@ -15,7 +15,7 @@ from typing import Any, get_args
 import msgspec
 import numpy as np
 
-from ckc_pin.base.sources import parse_xml, write_texts
+from ckc_pin.base.sources import parse_xml, write_files
 from ckc_pin.base.toml import read_text
 from ckc_pin.base.toml_writer import LINE_WIDTH, format_key, format_value, to_table
 from ckc_pin.errors import ImportNote, InputError, MechanismError, printable
@@ -162,7 +162,7 @@ def write(draft: Draft, folder: Path, overwrite: bool = False) -> list[Path]:
     InputError
         A file exists already, or the folder is not writable.
     """
-    return write_texts(folder, draft_texts(draft), overwrite)
+    return write_files(folder, draft_texts(draft), overwrite)
 
 
 def draft_texts(draft: Draft) -> dict[str, str]:

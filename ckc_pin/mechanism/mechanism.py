@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.sources import Sources, write_texts
+from ckc_pin.base.sources import Sources, write_files
 from ckc_pin.base.summary import HasSummary, Row, Summary, format_quantities
 from ckc_pin.base.validation import require_path
 from ckc_pin.errors import InputError, MechanismError
@@ -230,7 +230,7 @@ class Mechanism(HasSummary):
                     f"Mechanism.save: {key} ({', '.join(names)}) are keys of a scene, and a mechanism.toml has none; "
                     "save a Scene of the mechanism"
                 )
-        write_texts(Path(folder), local_texts(self), overwrite)
+        write_files(Path(folder), local_texts(self), overwrite)
         return Path(folder) / MECHANISM_FILE
 
     def summary(self) -> Summary:

@@ -10,7 +10,7 @@ from ckc_pin.mechanism.couplings import coupled_joints, find_coupling
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import split_component, split_name
 
-__all__ = ["effort", "joined", "motor_units", "parameter_unit", "row_units"]
+__all__ = ["ROTOR", "STIFF", "VISCOUS", "effort", "joined", "motor_units", "parameter_unit", "row_units"]
 
 ROTOR = {"m": "kg", "rad": "kg m²"}  # inertia of a coordinate, by its unit
 STIFF = {"m": "N/m", "rad": "N m/rad"}

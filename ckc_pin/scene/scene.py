@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.sources import Sources, write_texts
+from ckc_pin.base.sources import Sources, write_files
 from ckc_pin.base.summary import HasSummary, Row, Summary
 from ckc_pin.base.toml import convert, read_text, read_toml
 from ckc_pin.base.toml_writer import to_toml_value
@@ -255,7 +255,7 @@ class Scene(HasSummary):
         if Path(name).name != name:
             raise InputError(f"Scene.save: name = {name!r:.80}: expected a file name without {SUFFIX}")
         file = f"{name}{SUFFIX}"
-        write_texts(Path(folder), scene_texts(self, file), overwrite)
+        write_files(Path(folder), scene_texts(self, file), overwrite)
         return Path(folder) / file
 
     def summary(self) -> Summary:

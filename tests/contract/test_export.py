@@ -250,7 +250,7 @@ def round_trip(
     """A mechanism, and the mechanism imported from its export."""
     original = spatial if request.param == "spatial" else load(request.param)
     folder = tmp_path_factory.mktemp("back")
-    file = exporting.write(export(original, "mjcf"), folder)
+    (file,) = exporting.write(export(original, "mjcf"), folder)
     importing.write(importing.read(file), folder / "back")
     return original, load(folder / "back")
 

@@ -89,7 +89,7 @@ MOVING = [
 @pytest.mark.parametrize("to", ["urdf", "sdf"])
 def test_an_exported_mechanism_moves_the_same_after_import(name: str, to: str, tmp_path: Path) -> None:
     original = load(name)
-    file = exporting.write(export(original, to), tmp_path)
+    (file,) = exporting.write(export(original, to), tmp_path)
     importing.write(importing.read(file), tmp_path / "back")
     text = (tmp_path / "back" / "mechanism.toml").read_text()
     gravity = f"gravity = {json.dumps(list(map(float, original.tree.model.gravity.linear)))}"
@@ -144,7 +144,7 @@ def test_loops_of_each_type_allow_the_same_motions(
     place = {"xyz": [0.3, 0.1, 0.2], "rpy": [0.4, -0.5, 0.6]}  # where all coordinates are zero, the frames coincide
     frames = {"frame_a": {"link": "crank", **place}, "frame_b": {"link": "bar", **place}}
     original = Mechanism.from_urdf(urdf, loops=[{"name": "joined", "type": kind, **frames, **keys}])
-    file = exporting.write(export(original, to), tmp_path)
+    (file,) = exporting.write(export(original, to), tmp_path)
     importing.write(importing.read(file), tmp_path / "back")
     imported = load(tmp_path / "back")
     assert original.d == imported.d == freedoms + 1
