@@ -1,14 +1,16 @@
 """Configurations, rates and accelerations of the whole tree from measured coordinates.
 
-Each measured coordinate is fitted by a spline of degree five, whose number of knots is chosen by generalized
-cross-validation. The loops then give all coordinates: at each instant the configuration on the constraint manifold
-that is nearest to the splines, weighted by their noise. Rates and accelerations follow in the same sense.
+Each measured coordinate is fitted by a spline of degree seven. Generalized cross-validation chooses its number of
+knots, and a quarter more are taken: the number that is best for values leaves a smoothing error of the accelerations,
+as large as that of noise, which no standard deviation includes. The loops then give all coordinates: at each instant
+the configuration on the constraint manifold that is nearest to the splines, weighted by their noise. Rates and
+accelerations follow in the same sense.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +22,11 @@ from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_spline",
-           "motion_along"]  # fmt: skip
+           "motion_along", "shift_motion"]  # fmt: skip
 
-DEGREE = 5
+DEGREE = 7
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
+MORE_KNOTS = 1.25  # times those of cross-validation
 MIN_SAMPLES_PER_KNOT = 3.0
 EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
 MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
@@ -79,7 +82,7 @@ class SplineFit(Immutable):
         Standard deviations of the spline, its rate and its acceleration in the interior, root mean squares.
     interval : float
         Distance of two knots, s.
-    factor : (6, coefficients) array
+    factor : (DEGREE + 1, coefficients) array
         Cholesky factor of the normal equations, as a band.
     """
 
@@ -93,14 +96,22 @@ class SplineFit(Immutable):
         """Return value, rate and acceleration, shape (3, len(t))."""
         return np.array([self.spline(t), self.spline.derivative(1)(t), self.spline.derivative(2)(t)])
 
-    def acceleration_errors(self, t: Array, weights: Array) -> Array:
-        """Return sums of weights (m, r) times errors of the acceleration, (r, coefficients) of variance 1 each."""
+    def errors(self, t: Array, gains: Array) -> Array:
+        """Return errors of sums of gains (3, m, r) times value, rate and acceleration at times (m,).
+
+        Returns
+        -------
+        (r, coefficients) array
+            Factors of independent errors of variance 1.
+        """
         from scipy.interpolate import BSpline
         from scipy.linalg import solve_banded
 
-        by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(2)
-        design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - 2)
-        sums = (weights.T @ design) @ by_coefficient.c[: design.shape[1]]
+        sums = np.zeros((gains.shape[2], len(self.spline.c)))
+        for k, gain in enumerate(gains):
+            by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(k)
+            design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - k)
+            sums += (gain.T @ design) @ by_coefficient.c[: design.shape[1]]
         lower = np.array([np.roll(row, -k) for k, row in enumerate(self.factor[::-1])])  # the transposed factor
         return self.noise * solve_banded((DEGREE, 0), lower, sums.T).T
 
@@ -111,25 +122,22 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     Raises
     ------
     InputError
-        Fewer than twelve measurements.
+        Fewer than sixteen measurements.
     """
     measured = np.isfinite(y)
     t, y = t[measured], y[measured]
     if len(t) < 2 * (DEGREE + 1):
         raise InputError(f"identify: {len(t)} measurements of one quantity; at least {2 * (DEGREE + 1)} are needed")
-    best: tuple[float, Any, int] | None = None
-    count, worse = 2.0, 0
-    while DEGREE + count <= len(t) / MIN_SAMPLES_PER_KNOT or best is None:
+    best, lowest = 2, np.inf
+    count, worse, most = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
+    while count <= most and worse <= 8:
         spline, size = _least_squares(t, y, int(count))
         score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
-        worse = 0 if best is None or score < best[0] else worse + 1
+        worse = 0 if score < lowest else worse + 1
         if not worse:
-            best = score, spline, size
-        if worse > 8:
-            break
+            best, lowest = int(count), score
         count = max(count + 1, count * KNOT_GROWTH)
-    assert best is not None
-    _, spline, size = best
+    spline, size = _least_squares(t, y, max(2, int(min(MORE_KNOTS * best, most))))
     if noise is None:
         noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
     interval = (t[-1] - t[0]) / (size - DEGREE)
@@ -233,6 +241,25 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std)
 
 
+def shift_motion(
+    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SplineFit], order: int, name: str, shift: float
+) -> MeasuredMotion:
+    """Return the motion with one spline (order 0), its rate (1) or its acceleration (2) shifted (InputError)."""
+    at = mechanism.tree.indices(tuple(fits), "identify: data")
+    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    shifts = np.zeros((3, len(motion.t), len(fits)))
+    shifts[order, :, list(fits).index(name)] = shift
+    if order == 2:
+        a_tree = motion.a_tree + np.einsum("knd,kd->kn", motion.rho, nearest.independent_part(motion.rho, shifts[2]))
+        return replace(motion, a_tree=a_tree)
+    measured = np.array([fit.values(motion.t) for fit in fits.values()]).transpose(1, 2, 0) + shifts
+    q_tree = motion.q_tree
+    if order == 0:
+        q_tree = nearest.solve_many(_all_coordinates(mechanism, q_tree), measured[0])
+    rho, v_tree, a_tree = nearest.rates(q_tree, measured[1], measured[2])
+    return replace(motion, q_tree=q_tree, v_tree=v_tree, a_tree=a_tree, rho=rho)
+
+
 def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
     """Estimate all coordinates and the independent rates at one time from the splines of at least d coordinates.
 
@@ -311,7 +338,7 @@ class _Nearest:
             if phi.shape[1]:
                 closing[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, phi[:, :, None])[:, :, 0]
             numbers = _all_coordinates(self.mechanism, q_tree)
-            dq = self._independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
+            dq = self.independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
             step = closing + np.einsum("knd,kd->kn", rho, dq)
             q_tree = integrate_many(tree, q_tree, step)
             if np.max(tree.step_size(step)) <= 1e-9:
@@ -322,7 +349,7 @@ class _Nearest:
         """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates."""
         tree = self.mechanism.tree
         phi, rho, phi_z = self._terms(q_tree)
-        v_tree = np.einsum("knd,kd->kn", rho, self._independent_part(rho, rates))
+        v_tree = np.einsum("knd,kd->kn", rho, self.independent_part(rho, rates))
         drift = np.zeros((len(q_tree), tree.n))
         if phi.shape[1]:
             J_dot_v = np.zeros_like(phi)
@@ -331,7 +358,7 @@ class _Nearest:
                 _, J = self._closure(integrate_many(tree, q_tree, far * step * v_tree))
                 J_dot_v += weight / (12 * step) * np.einsum("krn,kn->kr", J, v_tree)
             drift[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, J_dot_v[:, :, None])[:, :, 0]
-        missing = self._independent_part(rho, accelerations - drift[:, self.at])
+        missing = self.independent_part(rho, accelerations - drift[:, self.at])
         return rho, v_tree, drift + np.einsum("knd,kd->kn", rho, missing)
 
     def _closure(self, q_tree: Array) -> tuple[Array, Array]:
@@ -349,7 +376,7 @@ class _Nearest:
             rho[:, partition.z] = -np.linalg.solve(phi_z, J[:, :, partition.q])
         return phi, rho, phi_z
 
-    def _independent_part(self, rho: Array, measured: Array) -> Array:
+    def independent_part(self, rho: Array, measured: Array) -> Array:
         """Return the least-squares solution q_dot (m, d) of rho q_dot = measured in the measured coordinates."""
         rows = rho[:, self.at] / self.noise[:, None]
         return np.einsum("kdi,ki->kd", np.linalg.pinv(rows), measured / self.noise)

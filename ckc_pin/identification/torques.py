@@ -11,7 +11,13 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import LinearFit, fit_linear, no_prior
-from ckc_pin.identification.measured_motion import MeasuredMotion, SplineFit, estimate_motion, fit_spline
+from ckc_pin.identification.measured_motion import (
+    MeasuredMotion,
+    SplineFit,
+    estimate_motion,
+    fit_spline,
+    shift_motion,
+)
 from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
@@ -23,6 +29,8 @@ __all__ = ["identify_torques"]
 
 MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
 MAX_DELAY, DELAY_GRID, MAX_DELAY_INSTANTS = 0.05, 21, 1000  # s; delays that are tried, with so many instants
+MAX_DIFFERENTIATED, MAX_COMPARED = 400, 50  # instants at which equations are differentiated, and errors compared
+MIN_SHIFT = 1e-6  # of a coordinate, rad or sizes of the mechanism, for a difference
 LEAK_TOLERANCE = 1e-6  # part of a gradient in directions that are not determined
 SATURATED = 0.999  # of a torque limit
 MAX_SATURATED = 0.5  # share of instants
@@ -73,8 +81,10 @@ def identify_torques(
             )
         fit = fit_linear(columns, right, prior_equations, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
+        known = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in fitted]
         fit = fit.with_errors(
-            [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
+            [e for x, part in zip(known, parts, strict=True) for e in x.steps(part)],
+            lambda lag: np.average([x.covariance(lag) for x in known], axis=0, weights=[len(x.t) for x in known]),
         )
         step = fit.x
         if physical:
@@ -123,9 +133,19 @@ def _equations(
     motion = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
     columns, force = regressor.rows(motion)
-    to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
-    right = np.einsum("kdm,km->kd", to_forces, tau) - force
-    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau, fits)
+    to_motors = np.linalg.pinv(_to_forces(mechanism, motion)).astype(float)
+    right = _generalized(mechanism, motion, tau) - force
+    return _Equations(record, motion, columns * regressor.scale, right, to_motors, tau, fits)
+
+
+def _to_forces(mechanism: Mechanism, motion: MeasuredMotion) -> Array:
+    """Return the matrices (m, d, motors) that give generalized forces from motor torques."""
+    return np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
+
+
+def _generalized(mechanism: Mechanism, motion: MeasuredMotion, tau: Array) -> Array:
+    """Return the generalized forces (m, d) of motor torques (m, motors)."""
+    return np.einsum("kdm,km->kd", _to_forces(mechanism, motion), tau)
 
 
 def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> Record:
@@ -152,18 +172,65 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
     return delayed(float(minimum.x))
 
 
-def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
-    """Return the steps of the solution (r, any) that errors of the accelerations cause, of unit variance each.
+@dataclass(frozen=True, eq=False)
+class _MotionErrors:
+    """Errors of the equations of a record that errors of its splines cause.
 
-    They are correlated over a knot interval and too small beside the noise of torques to show in the residuals. The
-    inertia that turns them into torques is that of the start values.
+    They are correlated over a knot interval, and may be too small beside the noise of torques to show in the residuals.
+
+    Attributes
+    ----------
+    gains : (3, m, d, coordinates) array
+        Derivatives of the residuals with respect to values, rates and accelerations of the measured coordinates.
     """
-    motion = equations.motion
-    at = mechanism.tree.indices(tuple(equations.fits), "identify")
-    D_tree = np.array([mechanism.tree.mass_matrix(q) for q in motion.q_tree])
-    by_coordinate = D_tree @ motion.rho @ np.linalg.pinv(motion.rho[:, at])
-    steps = influence @ (motion.rho.swapaxes(1, 2) @ by_coordinate)  # (m, r, coordinates)
-    return [fit.acceleration_errors(motion.t, steps[:, :, k]) for k, fit in enumerate(equations.fits.values())]
+
+    t: Array
+    gains: Array
+    fits: Sequence[SplineFit]
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, regressor: TorqueRegressor, equations: _Equations, x: Array) -> _MotionErrors:
+        """Differentiate the equations with unknowns x at some instants, and interpolate between them."""
+        some = np.unique(np.linspace(0, len(equations.motion.t) - 1, MAX_DIFFERENTIATED).astype(int))
+        full, tau = equations.motion, equations.tau[some]
+        motion = replace(full, **{key: getattr(full, key)[some] for key in ("t", "q_tree", "v_tree", "a_tree", "rho")})
+
+        def residual(at: MeasuredMotion) -> Array:
+            columns, force = regressor.rows(at)
+            return _generalized(mechanism, at, tau) - force - columns @ (regressor.scale * x)
+
+        before = residual(motion)
+        gains = np.zeros((3, len(full.t), before.shape[1], len(equations.fits)))
+        for k, (name, fit) in enumerate(equations.fits.items()):
+            least = MIN_SHIFT * mechanism.tree.step_scale[mechanism.tree.index[name]]
+            for order in range(3):
+                shift = max(fit.std[order], least / fit.interval**order)
+                shifted = residual(shift_motion(mechanism, motion, equations.fits, order, name, shift))
+                for i, column in enumerate((shifted - before).T / shift):
+                    gains[order, :, i, k] = np.interp(full.t, motion.t, column)
+        return cls(full.t, gains, list(equations.fits.values()))
+
+    def steps(self, influence: Array) -> list[Array]:
+        """Return the steps (r, any) of a solution with such influence (m, r, d), of unit variance each."""
+        return [
+            fit.errors(self.t, np.einsum("krd,okd->okr", influence, self.gains[..., k]))
+            for k, fit in enumerate(self.fits)
+        ]
+
+    def covariance(self, lag: int) -> Array:
+        """Return the mean covariance (d, d) at two instants that are `lag` apart."""
+        first = np.unique(np.linspace(0, len(self.t) - 1 - lag, MAX_COMPARED).astype(int))
+        total = np.zeros((self.gains.shape[2],) * 2)
+        for k, fit in enumerate(self.fits):
+            one, other = (self._at(at, k, fit) for at in (first, first + lag))
+            total += np.einsum("kic,kjc->ij", one, other) / len(first)
+        return (total + total.T) / 2
+
+    def _at(self, at: Array, k: int, fit: SplineFit) -> Array:
+        """Return the errors (instants, d, any) that errors of one spline cause at some instants."""
+        gains = self.gains[..., k][:, at]
+        apart = np.einsum("okd,kl->okld", gains, np.eye(len(at))).reshape(3, len(at), -1)
+        return fit.errors(self.t[at], apart).reshape(len(at), gains.shape[2], -1)
 
 
 def _prediction(equations: _Equations, motors: Sequence[str], step: Array, fit: LinearFit) -> Prediction:

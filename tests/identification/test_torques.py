@@ -287,7 +287,7 @@ BAD = [
     ({"t": [0.0, 1.0], "theta_1": [0, 90.0], "theta_3": [0, 0], "tau.theta_1": [0, 0], "tau.theta_3": [0, 0]},
      "theta_1 reaches 90 rad; if these are degrees"),
     ({"t": [0.0, 1.0], "theta_1": [0, 0], "theta_3": [0, 0], "tau.theta_1": [0, 0], "tau.theta_3": [0, 0]},
-     "2 measurements of one quantity; at least 12"),
+     "2 measurements of one quantity; at least 16"),
 ]  # fmt: skip
 
 
