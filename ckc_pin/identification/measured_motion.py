@@ -17,11 +17,12 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.errors import InputError
+from ckc_pin.identification.records import Record
 from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_spline",
+__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_splines",
            "motion_along", "shift_motion"]  # fmt: skip
 
 DEGREE = 7
@@ -33,8 +34,8 @@ MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
 DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
 OFF_BRANCH = (
-    "identify: the loops do not let the mechanism follow the measured coordinates; they are of another branch or "
-    "another mechanism, or in other units"
+    "the loops do not let the mechanism follow the measured coordinates; they are of another branch (q_guess in the "
+    "mechanism's file chooses it) or another mechanism, have an offset, or are in other units"
 )
 FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
 
@@ -116,8 +117,18 @@ class SplineFit(Immutable):
         return self.noise * solve_banded((DEGREE, 0), lower, sums.T).T
 
 
-def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
+def fit_splines(record: Record, names: Sequence[str]) -> dict[str, SplineFit]:
+    """Fit splines to measured quantities of a record (InputError)."""
+    return {
+        name: fit_spline(f"{record.source}: {name}", record.times(name), record.values[name], record.noise.get(name))
+        for name in names
+    }
+
+
+def fit_spline(name: str, t: Array, y: Array, noise: float | None = None) -> SplineFit:
     """Fit a spline to measurements y at increasing times t, which may be unequal; NaN marks gaps.
+
+    Messages call the quantity `name`.
 
     Raises
     ------
@@ -127,7 +138,7 @@ def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
     measured = np.isfinite(y)
     t, y = t[measured], y[measured]
     if len(t) < 2 * (DEGREE + 1):
-        raise InputError(f"identify: {len(t)} measurements of one quantity; at least {2 * (DEGREE + 1)} are needed")
+        raise InputError(f"identify: {name}: {len(t)} values; at least {2 * (DEGREE + 1)} are needed")
     best, lowest = 2, np.inf
     count, worse, most = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
     while count <= most and worse <= 8:
@@ -221,14 +232,17 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     margin = EDGE * max(fit.interval for fit in fits.values())
     instants = instants[(instants >= t[0] + margin) & (instants <= t[-1] - margin)]
     if not len(instants):
-        raise InputError(f"identify: the data last {t[-1] - t[0]:.3g} s, too short for a spline of {', '.join(names)}")
+        raise InputError(
+            f"identify: the data last {t[-1] - t[0]:.3g} s, too short for splines of {', '.join(names)}, which need "
+            f"more than {2 * margin:.3g} s; record a longer motion"
+        )
     nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
     here = nearest.start(measured[0, 0], names)
     few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
     followed = []
     for k in few:
-        here = nearest.solve(here, measured[0, k])
+        here = nearest.solve(here, measured[0, k], f"at t = {instants[k]:.4g} s")
         followed.append(tree.to_coordinates(here.q_tree))
     guess = np.array([np.interp(instants, instants[few], column) for column in np.array(followed).T]).T
     q_tree = nearest.solve_many(guess, measured[0])
@@ -310,10 +324,10 @@ class _Nearest:
             largest = names[int(np.argmax(np.abs(measured)))]
             raise InputError(f"identify: {largest} begins at {np.abs(measured).max():.4g}; are its values in degrees?")
         for k in range(1, steps + 1):
-            here = self.solve(here, first + (measured - first) * k / steps)
+            here = self.solve(here, first + (measured - first) * k / steps, "at the first instant")
         return here
 
-    def solve(self, here: Kinematics, measured: Array) -> Kinematics:
+    def solve(self, here: Kinematics, measured: Array, when: str) -> Kinematics:
         """Return the nearest closed configuration, by Gauss-Newton on the constraint manifold."""
         mechanism, tree = self.mechanism, self.mechanism.tree
         for _ in range(MAX_ITERATIONS):
@@ -326,7 +340,7 @@ class _Nearest:
             here = here.integrate(step)
             if tree.step_size(step) <= 1e-10 and np.abs(here.phi).max(initial=0.0) <= mechanism.tolerance:
                 return here
-        raise InputError(OFF_BRANCH)
+        raise InputError(f"identify: {when} {OFF_BRANCH}")
 
     def solve_many(self, guess: Array, measured: Array) -> Array:
         """Return the nearest closed configurations (m, nq) to measurements, from guesses (m, n) of all coordinates."""
@@ -343,7 +357,7 @@ class _Nearest:
             q_tree = integrate_many(tree, q_tree, step)
             if np.max(tree.step_size(step)) <= 1e-9:
                 return q_tree
-        raise InputError(OFF_BRANCH)
+        raise InputError(f"identify: {OFF_BRANCH}")
 
     def rates(self, q_tree: Array, rates: Array, accelerations: Array) -> tuple[Array, Array, Array]:
         """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates."""

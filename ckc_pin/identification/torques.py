@@ -15,11 +15,11 @@ from ckc_pin.identification.measured_motion import (
     MeasuredMotion,
     SplineFit,
     estimate_motion,
-    fit_spline,
+    fit_splines,
     shift_motion,
 )
 from ckc_pin.identification.priors import make_prior
-from ckc_pin.identification.records import Record, require_radians
+from ckc_pin.identification.records import Record, describe_missing, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
 from ckc_pin.identification.structure import MotionAdvice
@@ -107,23 +107,23 @@ def _equations(
     """Estimate the motion of a record, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
-    missing = [name for name in torques if name not in record.values]
-    if len(names) < mechanism.d or missing:
-        required = missing or list(mechanism.independent)
-        raise InputError(
-            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torque of "
-            f"every motor are needed, there are {', '.join(record.values) or 'none'}"
-        )
+    required = [*torques, *(mechanism.independent if len(names) < mechanism.d else ())]
+    missing = [name for name in required if name not in record.values]
+    if missing:
+        needed = f"{mechanism.d} coordinates and the torque of every motor"
+        raise InputError(describe_missing(record, missing, needed))
     require_radians(mechanism, record, names)
-    fits = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in names}
+    fits = fit_splines(record, names)
     tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
     limit = mechanism.motors.torque_limit
     saturated = np.any((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=1) & used
     if saturated.sum() > MAX_SATURATED * used.sum():
+        k = int(np.argmax(np.sum((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=0)))
         raise InputError(
-            f"identify: {record.source}: a motor is at its torque limit most of the time; record a slower motion"
+            f"identify: {record.source}: {torques[k]} is at its limit, {limit[0, k]:.4g} to {limit[1, k]:.4g}, most of "
+            "the time, and may be wrong there; record a slower motion, or correct torque_limit"
         )
     if saturated.any():
         warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
