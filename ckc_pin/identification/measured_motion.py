@@ -140,15 +140,15 @@ def fit_spline(name: str, t: Array, y: Array, noise: float | None = None) -> Spl
     if len(t) < 2 * (DEGREE + 1):
         raise InputError(f"identify: {name}: {len(t)} values; at least {2 * (DEGREE + 1)} are needed")
     best, lowest = 2, np.inf
-    count, worse, most = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
-    while count <= most and worse <= 8:
+    count, worse, max_count = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
+    while count <= max_count and worse <= 8:
         spline, size = _least_squares(t, y, int(count))
         score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
         worse = 0 if score < lowest else worse + 1
         if not worse:
             best, lowest = int(count), score
         count = max(count + 1, count * KNOT_GROWTH)
-    spline, size = _least_squares(t, y, max(2, int(min(MORE_KNOTS * best, most))))
+    spline, size = _least_squares(t, y, max(2, int(min(MORE_KNOTS * best, max_count))))
     if noise is None:
         noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
     interval = (t[-1] - t[0]) / (size - DEGREE)

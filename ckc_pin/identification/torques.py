@@ -81,10 +81,12 @@ def identify_torques(
             )
         fit = fit_linear(columns, right, prior_equations, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
-        known = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in fitted]
+        errors_of_motion = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in fitted]
         fit = fit.with_errors(
-            [e for x, part in zip(known, parts, strict=True) for e in x.steps(part)],
-            lambda lag: np.average([x.covariance(lag) for x in known], axis=0, weights=[len(x.t) for x in known]),
+            [e for x, part in zip(errors_of_motion, parts, strict=True) for e in x.steps(part)],
+            lambda lag: np.average(
+                [x.covariance(lag) for x in errors_of_motion], axis=0, weights=[len(x.t) for x in errors_of_motion]
+            ),
         )
         step = fit.x
         if physical:
@@ -202,9 +204,9 @@ class _MotionErrors:
         before = residual(motion)
         gains = np.zeros((3, len(full.t), before.shape[1], len(equations.fits)))
         for k, (name, fit) in enumerate(equations.fits.items()):
-            least = MIN_SHIFT * mechanism.tree.step_scale[mechanism.tree.index[name]]
+            smallest = MIN_SHIFT * mechanism.tree.step_scale[mechanism.tree.index[name]]
             for order in range(3):
-                shift = max(fit.std[order], least / fit.interval**order)
+                shift = max(fit.std[order], smallest / fit.interval**order)
                 shifted = residual(shift_motion(mechanism, motion, equations.fits, order, name, shift))
                 for i, column in enumerate((shifted - before).T / shift):
                     gains[order, :, i, k] = np.interp(full.t, motion.t, column)
