@@ -6,7 +6,7 @@ smaller than half of such a unit. Every other direction is left out of the solut
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -49,6 +49,10 @@ class LinearFit(Immutable):
     residual : (m, d) array
     noise : (d, d) array
         Covariance of the residuals of one instant.
+    weights : (m,) array
+        Of the instants.
+    by_prior : (r, r) array
+        Part of the covariance along the determined directions that comes from errors of the prior.
     correlation_time : int
         Instants over which residuals are correlated, 0 if they are independent.
     condition : float
@@ -65,14 +69,36 @@ class LinearFit(Immutable):
     influence: Array
     residual: Array
     noise: Array
+    weights: Array
+    by_prior: Array
     correlation_time: int
     condition: float
     rank: int
 
-    def with_errors(self, errors: Sequence[Array]) -> LinearFit:
-        """Add errors that do not average out: steps (r, any) along the determined directions, of unit variance each."""
-        covariance = sum((self.determined @ x @ x.T @ self.determined.T for x in errors), self.covariance)
-        return replace(self, covariance=covariance)
+    def with_errors(self, errors: Sequence[Array], expected: Callable[[int], Array]) -> LinearFit:
+        """Take errors into account that are known to be in the residuals, and do not average out as noise does.
+
+        Parameters
+        ----------
+        errors : sequence of (r, any) arrays
+            Steps along the determined directions, of unit variance each.
+        expected : callable
+            The covariance (d, d) of these errors at instants that are `lag` apart.
+        """
+        sizes = np.linalg.cholesky(self.noise)
+        whitening = np.linalg.inv(sizes)
+        lag = _correlation_time(
+            self.residual @ whitening.T, lambda k: float(np.trace(whitening @ expected(k) @ whitening.T))
+        )
+        covariance = self.covariance
+        if not lag:
+            values, vectors = np.linalg.eigh(np.eye(len(sizes)) - whitening @ expected(0) @ whitening.T)
+            steps = self.influence @ (sizes @ vectors * np.sqrt(np.maximum(values, 0.0)))
+            inside = np.einsum("kri,ksi->rs", steps / self.weights[:, None, None], steps) + self.by_prior
+            covariance = self.determined @ inside @ self.determined.T
+        for x in errors:
+            covariance = covariance + self.determined @ x @ x.T @ self.determined.T
+        return replace(self, covariance=covariance, correlation_time=lag)
 
     def combinations(self, tolerance: float) -> tuple[IntArray, Array]:
         """Return one unknown for each direction that data determine, and coefficients (k, p) of what they determine.
@@ -176,26 +202,36 @@ def _solution(
     whitened = b - A @ svd.solve(svd.rank)
     lag = _correlation_time(whitened)
     scores = np.einsum("kdp,kd->kp", A @ basis, whitened)
-    meat = np.diag(s[:keep] ** 2)
+    meat, of_prior = np.diag(s[:keep] ** 2), (prior[0] @ basis).T @ (prior[0] @ basis)
+    squares = np.outer(s[:keep] ** 2, s[:keep] ** 2)
     if lag:
-        meat = scores.T @ scores + (prior[0] @ basis).T @ (prior[0] @ basis)
+        meat = scores.T @ scores + of_prior
         for k in range(1, lag + 1):
             product = scores[k:].T @ scores[:-k]
             meat += (1 - k / (lag + 1)) * (product + product.T)
-    inside = meat / np.outer(s[:keep] ** 2, s[:keep] ** 2)
+    inside = meat / squares
     condition = float(s[0] / s[keep - 1]) if keep else float("inf")
     influence = ((A @ basis) * np.sqrt(weights)[:, None, None] / s[:keep] ** 2).swapaxes(1, 2) @ whitening
     return LinearFit(
         svd.solve(keep), basis @ inside @ basis.T if keep else np.zeros((p, p)), basis, s[:keep],
-        by_data.v[: by_data.determined].T, influence, residual, noise, lag, condition, svd.rank,
+        by_data.v[: by_data.determined].T, influence, residual, noise, weights,
+        of_prior / squares, lag, condition, svd.rank,
     )  # fmt: skip
 
 
-def _correlation_time(residual: Array) -> int:
-    """Return the number of instants after which residuals are uncorrelated; 0 if neighbours are."""
+def _correlation_time(residual: Array, expected: Callable[[int], float] = lambda lag: 0.0) -> int:
+    """Return the number of instants after which residuals are as correlated as expected; 0 if neighbours are.
+
+    Parameters
+    ----------
+    residual : (m, d) array
+    expected : callable
+        Mean product of residuals that are `lag` instants apart, which is known.
+    """
     centred = residual - residual.mean(axis=0)
     power = float(np.sum(centred**2))
     for lag in range(1, max(2, int(MAX_LAG * len(residual)))):
-        if power <= 0 or float(np.sum(centred[lag:] * centred[:-lag])) <= WHITE * power:
+        excess = float(np.sum(centred[lag:] * centred[:-lag])) - expected(lag) * (len(residual) - lag)
+        if power <= 0 or excess <= WHITE * power:
             return 0 if lag == 1 else 2 * lag
     return int(MAX_LAG * len(residual))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def identify(
         raise InputError(f'identify: method: expected "torques" or "motion", got {describe_value(method)}')
     mechanism = as_mechanism(mechanism, "identify")
     records = [
-        Record(x.source, x.t, x.values, {**(noise or {}), **x.noise}, x.delay, for_validation)
+        replace(x, noise={**(noise or {}), **x.noise}, validation=for_validation)
         for group, for_validation in ((data, False), (validation, True))
         for x in (read_record(part, mechanism) for part in _as_list(group))
     ]

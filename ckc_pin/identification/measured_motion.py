@@ -1,37 +1,41 @@
 """Configurations, rates and accelerations of the whole tree from measured coordinates.
 
-Each measured coordinate is fitted by a spline of degree five, whose number of knots is chosen by generalized
-cross-validation. The loops then give all coordinates: at each instant the configuration on the constraint manifold
-that is nearest to the splines, weighted by their noise. Rates and accelerations follow in the same sense.
+Each measured coordinate is fitted by a spline of degree seven. Generalized cross-validation chooses its number of
+knots, and a quarter more are taken: the number that is best for values leaves a smoothing error of the accelerations,
+as large as that of noise, which no standard deviation includes. The loops then give all coordinates: at each instant
+the configuration on the constraint manifold that is nearest to the splines, weighted by their noise. Rates and
+accelerations follow in the same sense.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.errors import InputError
+from ckc_pin.identification.records import Record
 from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_spline",
-           "motion_along"]  # fmt: skip
+__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_splines",
+           "motion_along", "shift_motion"]  # fmt: skip
 
-DEGREE = 5
+DEGREE = 7
 KNOT_GROWTH = 1.25  # between numbers of knots that are compared
+MORE_KNOTS = 1.25  # times those of cross-validation
 MIN_SAMPLES_PER_KNOT = 3.0
 EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
 MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
 DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
 OFF_BRANCH = (
-    "identify: the loops do not let the mechanism follow the measured coordinates; they are of another branch or "
-    "another mechanism, or in other units"
+    "the loops do not let the mechanism follow the measured coordinates; they are of another branch (q_guess in the "
+    "mechanism's file chooses it) or another mechanism, have an offset, or are in other units"
 )
 FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
 
@@ -79,7 +83,7 @@ class SplineFit(Immutable):
         Standard deviations of the spline, its rate and its acceleration in the interior, root mean squares.
     interval : float
         Distance of two knots, s.
-    factor : (6, coefficients) array
+    factor : (DEGREE + 1, coefficients) array
         Cholesky factor of the normal equations, as a band.
     """
 
@@ -93,43 +97,58 @@ class SplineFit(Immutable):
         """Return value, rate and acceleration, shape (3, len(t))."""
         return np.array([self.spline(t), self.spline.derivative(1)(t), self.spline.derivative(2)(t)])
 
-    def acceleration_errors(self, t: Array, weights: Array) -> Array:
-        """Return sums of weights (m, r) times errors of the acceleration, (r, coefficients) of variance 1 each."""
+    def errors(self, t: Array, gains: Array) -> Array:
+        """Return errors of sums of gains (3, m, r) times value, rate and acceleration at times (m,).
+
+        Returns
+        -------
+        (r, coefficients) array
+            Factors of independent errors of variance 1.
+        """
         from scipy.interpolate import BSpline
         from scipy.linalg import solve_banded
 
-        by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(2)
-        design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - 2)
-        sums = (weights.T @ design) @ by_coefficient.c[: design.shape[1]]
+        sums = np.zeros((gains.shape[2], len(self.spline.c)))
+        for k, gain in enumerate(gains):
+            by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(k)
+            design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - k)
+            sums += (gain.T @ design) @ by_coefficient.c[: design.shape[1]]
         lower = np.array([np.roll(row, -k) for k, row in enumerate(self.factor[::-1])])  # the transposed factor
         return self.noise * solve_banded((DEGREE, 0), lower, sums.T).T
 
 
-def fit_spline(t: Array, y: Array, noise: float | None = None) -> SplineFit:
+def fit_splines(record: Record, names: Sequence[str]) -> dict[str, SplineFit]:
+    """Fit splines to measured quantities of a record (InputError)."""
+    return {
+        name: fit_spline(f"{record.source}: {name}", record.times(name), record.values[name], record.noise.get(name))
+        for name in names
+    }
+
+
+def fit_spline(name: str, t: Array, y: Array, noise: float | None = None) -> SplineFit:
     """Fit a spline to measurements y at increasing times t, which may be unequal; NaN marks gaps.
+
+    Messages call the quantity `name`.
 
     Raises
     ------
     InputError
-        Fewer than twelve measurements.
+        Fewer than sixteen measurements.
     """
     measured = np.isfinite(y)
     t, y = t[measured], y[measured]
     if len(t) < 2 * (DEGREE + 1):
-        raise InputError(f"identify: {len(t)} measurements of one quantity; at least {2 * (DEGREE + 1)} are needed")
-    best: tuple[float, Any, int] | None = None
-    count, worse = 2.0, 0
-    while DEGREE + count <= len(t) / MIN_SAMPLES_PER_KNOT or best is None:
+        raise InputError(f"identify: {name}: {len(t)} values; at least {2 * (DEGREE + 1)} are needed")
+    best, lowest = 2, np.inf
+    count, worse, max_count = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
+    while count <= max_count and worse <= 8:
         spline, size = _least_squares(t, y, int(count))
         score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
-        worse = 0 if best is None or score < best[0] else worse + 1
+        worse = 0 if score < lowest else worse + 1
         if not worse:
-            best = score, spline, size
-        if worse > 8:
-            break
+            best, lowest = int(count), score
         count = max(count + 1, count * KNOT_GROWTH)
-    assert best is not None
-    _, spline, size = best
+    spline, size = _least_squares(t, y, max(2, int(min(MORE_KNOTS * best, max_count))))
     if noise is None:
         noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
     interval = (t[-1] - t[0]) / (size - DEGREE)
@@ -213,14 +232,17 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     margin = EDGE * max(fit.interval for fit in fits.values())
     instants = instants[(instants >= t[0] + margin) & (instants <= t[-1] - margin)]
     if not len(instants):
-        raise InputError(f"identify: the data last {t[-1] - t[0]:.3g} s, too short for a spline of {', '.join(names)}")
+        raise InputError(
+            f"identify: the data last {t[-1] - t[0]:.3g} s, too short for splines of {', '.join(names)}, which need "
+            f"more than {2 * margin:.3g} s; record a longer motion"
+        )
     nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
     here = nearest.start(measured[0, 0], names)
     few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
     followed = []
     for k in few:
-        here = nearest.solve(here, measured[0, k])
+        here = nearest.solve(here, measured[0, k], f"at t = {instants[k]:.4g} s")
         followed.append(tree.to_coordinates(here.q_tree))
     guess = np.array([np.interp(instants, instants[few], column) for column in np.array(followed).T]).T
     q_tree = nearest.solve_many(guess, measured[0])
@@ -231,6 +253,25 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     by_rate = [(r @ np.linalg.pinv(r[at])) * spread for r in rho[:: max(1, len(rho) // 20)]]
     v_std = np.sqrt(np.mean(np.square(by_rate), axis=0).sum(axis=1))
     return MeasuredMotion(instants, q_tree, v_tree, a_tree, rho, v_std)
+
+
+def shift_motion(
+    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SplineFit], order: int, name: str, shift: float
+) -> MeasuredMotion:
+    """Return the motion with one spline (order 0), its rate (1) or its acceleration (2) shifted (InputError)."""
+    at = mechanism.tree.indices(tuple(fits), "identify: data")
+    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    shifts = np.zeros((3, len(motion.t), len(fits)))
+    shifts[order, :, list(fits).index(name)] = shift
+    if order == 2:
+        a_tree = motion.a_tree + np.einsum("knd,kd->kn", motion.rho, nearest.independent_part(motion.rho, shifts[2]))
+        return replace(motion, a_tree=a_tree)
+    measured = np.array([fit.values(motion.t) for fit in fits.values()]).transpose(1, 2, 0) + shifts
+    q_tree = motion.q_tree
+    if order == 0:
+        q_tree = nearest.solve_many(_all_coordinates(mechanism, q_tree), measured[0])
+    rho, v_tree, a_tree = nearest.rates(q_tree, measured[1], measured[2])
+    return replace(motion, q_tree=q_tree, v_tree=v_tree, a_tree=a_tree, rho=rho)
 
 
 def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
@@ -283,10 +324,10 @@ class _Nearest:
             largest = names[int(np.argmax(np.abs(measured)))]
             raise InputError(f"identify: {largest} begins at {np.abs(measured).max():.4g}; are its values in degrees?")
         for k in range(1, steps + 1):
-            here = self.solve(here, first + (measured - first) * k / steps)
+            here = self.solve(here, first + (measured - first) * k / steps, "at the first instant")
         return here
 
-    def solve(self, here: Kinematics, measured: Array) -> Kinematics:
+    def solve(self, here: Kinematics, measured: Array, when: str) -> Kinematics:
         """Return the nearest closed configuration, by Gauss-Newton on the constraint manifold."""
         mechanism, tree = self.mechanism, self.mechanism.tree
         for _ in range(MAX_ITERATIONS):
@@ -299,7 +340,7 @@ class _Nearest:
             here = here.integrate(step)
             if tree.step_size(step) <= 1e-10 and np.abs(here.phi).max(initial=0.0) <= mechanism.tolerance:
                 return here
-        raise InputError(OFF_BRANCH)
+        raise InputError(f"identify: {when} {OFF_BRANCH}")
 
     def solve_many(self, guess: Array, measured: Array) -> Array:
         """Return the nearest closed configurations (m, nq) to measurements, from guesses (m, n) of all coordinates."""
@@ -311,18 +352,18 @@ class _Nearest:
             if phi.shape[1]:
                 closing[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, phi[:, :, None])[:, :, 0]
             numbers = _all_coordinates(self.mechanism, q_tree)
-            dq = self._independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
+            dq = self.independent_part(rho, measured - numbers[:, self.at] - closing[:, self.at])
             step = closing + np.einsum("knd,kd->kn", rho, dq)
             q_tree = integrate_many(tree, q_tree, step)
             if np.max(tree.step_size(step)) <= 1e-9:
                 return q_tree
-        raise InputError(OFF_BRANCH)
+        raise InputError(f"identify: {OFF_BRANCH}")
 
     def rates(self, q_tree: Array, rates: Array, accelerations: Array) -> tuple[Array, Array, Array]:
         """Return rho (m, n, d), and rates and accelerations (m, n) of all coordinates."""
         tree = self.mechanism.tree
         phi, rho, phi_z = self._terms(q_tree)
-        v_tree = np.einsum("knd,kd->kn", rho, self._independent_part(rho, rates))
+        v_tree = np.einsum("knd,kd->kn", rho, self.independent_part(rho, rates))
         drift = np.zeros((len(q_tree), tree.n))
         if phi.shape[1]:
             J_dot_v = np.zeros_like(phi)
@@ -331,7 +372,7 @@ class _Nearest:
                 _, J = self._closure(integrate_many(tree, q_tree, far * step * v_tree))
                 J_dot_v += weight / (12 * step) * np.einsum("krn,kn->kr", J, v_tree)
             drift[:, self.mechanism.partition.z] = -np.linalg.solve(phi_z, J_dot_v[:, :, None])[:, :, 0]
-        missing = self._independent_part(rho, accelerations - drift[:, self.at])
+        missing = self.independent_part(rho, accelerations - drift[:, self.at])
         return rho, v_tree, drift + np.einsum("knd,kd->kn", rho, missing)
 
     def _closure(self, q_tree: Array) -> tuple[Array, Array]:
@@ -349,7 +390,7 @@ class _Nearest:
             rho[:, partition.z] = -np.linalg.solve(phi_z, J[:, :, partition.q])
         return phi, rho, phi_z
 
-    def _independent_part(self, rho: Array, measured: Array) -> Array:
+    def independent_part(self, rho: Array, measured: Array) -> Array:
         """Return the least-squares solution q_dot (m, d) of rho q_dot = measured in the measured coordinates."""
         rows = rho[:, self.at] / self.noise[:, None]
         return np.einsum("kdi,ki->kd", np.linalg.pinv(rows), measured / self.noise)

@@ -16,8 +16,8 @@ from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.control.controllers import RecordedTorques
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_spline
-from ckc_pin.identification.records import Record, require_radians
+from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_splines
+from ckc_pin.identification.records import Record, describe_missing, require_radians
 from ckc_pin.identification.unknowns import LINK_VALUES, ParameterValue, Unknown, Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES
@@ -117,25 +117,26 @@ def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> Re
     """Return a record with the torques of its run, and estimate its start."""
     coordinates = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
-    missing = [name for name in torques if name not in record.values]
-    if len(coordinates) < mechanism.d or 0 < len(missing) < len(torques):
-        required = mechanism.independent if len(coordinates) < mechanism.d else missing
-        raise InputError(
-            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torques of "
-            f"all motors or of none are needed, there are {', '.join(record.values) or 'none'}"
-        )
+    required = list(mechanism.independent) if len(coordinates) < mechanism.d else []
+    if any(name in record.values for name in torques):
+        required += torques
+    missing = [name for name in required if name not in record.values]
+    if missing:
+        needed = f"{mechanism.d} coordinates and the torques of all motors or of none"
+        raise InputError(describe_missing(record, missing, needed))
     estimated = next((name for name, delay in record.delay.items() if isinstance(delay, str)), None)
     if estimated is not None:
         raise InputError(
             f'identify: {record.source}: delay: {estimated}: method = "torques" estimates delays; give the delay in s'
         )
-    if missing:
+    has_torques = all(name in record.values for name in torques)
+    if not has_torques:
         warnings.append(f"{record.source}: no torques were recorded, so the motors count as unpowered")
     require_radians(mechanism, record, coordinates)
     names = [name for name, x in record.values.items() if name not in torques and np.isfinite(x).any()]
     t = np.array([record.times(name) for name in names]).T
     values = np.array([record.values[name] for name in names]).T
-    series = {} if missing else {name: _measured(record, name) for name in torques}
+    series = {name: _measured(record, name) for name in torques} if has_torques else {}
     begin, end = (max((x[0] for x, _ in series.values()), default=-np.inf),
                   min((x[-1] for x, _ in series.values()), default=np.inf))  # fmt: skip
     outside = np.isfinite(values) & ((t < begin) | (t > end))
@@ -150,7 +151,7 @@ def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> Re
         at = mechanism.tree.indices(tuple(coordinates), "identify: data")
         order, _ = pivoted_columns(mechanism.assembled.rho[at].T)
         chosen = [coordinates[k] for k in np.sort(order[: mechanism.d])]
-    splines = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in chosen}
+    splines = fit_splines(record, chosen)
     q, q_dot = estimate_start(mechanism, splines, first)
     controller = _interpolated(list(series.values()), first) if series else None
     return RecordedMotion(record, names, t - first, values, controller, q, q_dot, splines)

@@ -42,6 +42,8 @@ class Record(Immutable):
     delay : mapping of str to float or "estimate"
         s.
     validation : bool
+    unused : tuple of str
+        Columns that are no quantity of the mechanism.
     """
 
     source: str
@@ -50,6 +52,7 @@ class Record(Immutable):
     noise: Mapping[str, float] = field(default_factory=dict)
     delay: Mapping[str, float | str] = field(default_factory=dict)
     validation: bool = False
+    unused: tuple[str, ...] = ()
 
     def times(self, quantity: str) -> Array:
         """Return the times at which the values of a quantity happened, s."""
@@ -110,7 +113,8 @@ def read_record(data: Any, mechanism: Mechanism, spec: DataSpec | None = None, f
             )
     inside = np.isfinite(t) if spec.span is None else (t >= spec.span[0]) & (t <= spec.span[1])
     values = {name: x[inside] for name, x in values.items()}
-    return Record(source, t[inside], values, spec.noise, spec.delay, spec.validation)
+    unused = tuple(name for name in columns if name not in (*values, "t"))
+    return Record(source, t[inside], values, spec.noise, spec.delay, spec.validation, unused)
 
 
 def _renamed(columns: Mapping[str, Array], spec: DataSpec, source: str) -> dict[str, str]:
@@ -178,7 +182,19 @@ def _require_increasing(t: Array, source: str) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if len(back):
         k = int(back[0])
-        raise InputError(f"{source}: t does not increase: {t[k]:.9g} is followed by {t[k + 1]:.9g} (row {k + 2})")
+        raise InputError(
+            f"{source}: t does not increase: {t[k]:.9g} is followed by {t[k + 1]:.9g} (value {k + 2}); sort the rows, "
+            "and give each recording as data of its own"
+        )
+
+
+def describe_missing(record: Record, missing: Sequence[str], needed: str) -> str:
+    """Return the message that a record has not the columns that are needed."""
+    message = f"identify: {record.source}: no column {', '.join(missing)}; {needed} are needed, there are "
+    message += ", ".join((*record.values, *record.unused)) or "none"
+    if record.unused:
+        message += f'; names = {{"{missing[0]}" = "COLUMN"}} takes a column of another name'
+    return message
 
 
 def require_radians(mechanism: Mechanism, record: Record, names: Sequence[str]) -> None:

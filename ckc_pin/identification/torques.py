@@ -11,9 +11,15 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import LinearFit, fit_linear, no_prior
-from ckc_pin.identification.measured_motion import MeasuredMotion, SplineFit, estimate_motion, fit_spline
+from ckc_pin.identification.measured_motion import (
+    MeasuredMotion,
+    SplineFit,
+    estimate_motion,
+    fit_splines,
+    shift_motion,
+)
 from ckc_pin.identification.priors import make_prior
-from ckc_pin.identification.records import Record, require_radians
+from ckc_pin.identification.records import Record, describe_missing, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
 from ckc_pin.identification.structure import MotionAdvice
@@ -23,6 +29,8 @@ __all__ = ["identify_torques"]
 
 MAX_INSTANTS = 20_000  # of one record; evenly spaced ones are used of more
 MAX_DELAY, DELAY_GRID, MAX_DELAY_INSTANTS = 0.05, 21, 1000  # s; delays that are tried, with so many instants
+MAX_DIFFERENTIATED, MAX_COMPARED = 400, 50  # instants at which equations are differentiated, and errors compared
+MIN_SHIFT = 1e-6  # of a coordinate, rad or sizes of the mechanism, for a difference
 LEAK_TOLERANCE = 1e-6  # part of a gradient in directions that are not determined
 SATURATED = 0.999  # of a torque limit
 MAX_SATURATED = 0.5  # share of instants
@@ -73,8 +81,12 @@ def identify_torques(
             )
         fit = fit_linear(columns, right, prior_equations, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
+        errors_of_motion = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in fitted]
         fit = fit.with_errors(
-            [e for x, part in zip(fitted, parts, strict=True) for e in _motion_errors(mechanism, x, part)]
+            [e for x, part in zip(errors_of_motion, parts, strict=True) for e in x.steps(part)],
+            lambda lag: np.average(
+                [x.covariance(lag) for x in errors_of_motion], axis=0, weights=[len(x.t) for x in errors_of_motion]
+            ),
         )
         step = fit.x
         if physical:
@@ -97,23 +109,23 @@ def _equations(
     """Estimate the motion of a record, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
-    missing = [name for name in torques if name not in record.values]
-    if len(names) < mechanism.d or missing:
-        required = missing or list(mechanism.independent)
-        raise InputError(
-            f"identify: {record.source}: no column {', '.join(required)}; {mechanism.d} coordinates and the torque of "
-            f"every motor are needed, there are {', '.join(record.values) or 'none'}"
-        )
+    required = [*torques, *(mechanism.independent if len(names) < mechanism.d else ())]
+    missing = [name for name in required if name not in record.values]
+    if missing:
+        needed = f"{mechanism.d} coordinates and the torque of every motor"
+        raise InputError(describe_missing(record, missing, needed))
     require_radians(mechanism, record, names)
-    fits = {name: fit_spline(record.times(name), record.values[name], record.noise.get(name)) for name in names}
+    fits = fit_splines(record, names)
     tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
     limit = mechanism.motors.torque_limit
     saturated = np.any((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=1) & used
     if saturated.sum() > MAX_SATURATED * used.sum():
+        k = int(np.argmax(np.sum((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=0)))
         raise InputError(
-            f"identify: {record.source}: a motor is at its torque limit most of the time; record a slower motion"
+            f"identify: {record.source}: {torques[k]} is at its limit, {limit[0, k]:.4g} to {limit[1, k]:.4g}, most of "
+            "the time, and may be wrong there; record a slower motion, or correct torque_limit"
         )
     if saturated.any():
         warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
@@ -123,9 +135,19 @@ def _equations(
     motion = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
     tau = tau[at][np.isin(times[at], motion.t)]
     columns, force = regressor.rows(motion)
-    to_forces = np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
-    right = np.einsum("kdm,km->kd", to_forces, tau) - force
-    return _Equations(record, motion, columns * regressor.scale, right, np.linalg.pinv(to_forces), tau, fits)
+    to_motors = np.linalg.pinv(_to_forces(mechanism, motion)).astype(float)
+    right = _generalized(mechanism, motion, tau) - force
+    return _Equations(record, motion, columns * regressor.scale, right, to_motors, tau, fits)
+
+
+def _to_forces(mechanism: Mechanism, motion: MeasuredMotion) -> Array:
+    """Return the matrices (m, d, motors) that give generalized forces from motor torques."""
+    return np.einsum("knd,mn->kdm", motion.rho, mechanism.motors.transmission)
+
+
+def _generalized(mechanism: Mechanism, motion: MeasuredMotion, tau: Array) -> Array:
+    """Return the generalized forces (m, d) of motor torques (m, motors)."""
+    return np.einsum("kdm,km->kd", _to_forces(mechanism, motion), tau)
 
 
 def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> Record:
@@ -152,18 +174,65 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
     return delayed(float(minimum.x))
 
 
-def _motion_errors(mechanism: Mechanism, equations: _Equations, influence: Array) -> list[Array]:
-    """Return the steps of the solution (r, any) that errors of the accelerations cause, of unit variance each.
+@dataclass(frozen=True, eq=False)
+class _MotionErrors:
+    """Errors of the equations of a record that errors of its splines cause.
 
-    They are correlated over a knot interval and too small beside the noise of torques to show in the residuals. The
-    inertia that turns them into torques is that of the start values.
+    They are correlated over a knot interval, and may be too small beside the noise of torques to show in the residuals.
+
+    Attributes
+    ----------
+    gains : (3, m, d, coordinates) array
+        Derivatives of the residuals with respect to values, rates and accelerations of the measured coordinates.
     """
-    motion = equations.motion
-    at = mechanism.tree.indices(tuple(equations.fits), "identify")
-    D_tree = np.array([mechanism.tree.mass_matrix(q) for q in motion.q_tree])
-    by_coordinate = D_tree @ motion.rho @ np.linalg.pinv(motion.rho[:, at])
-    steps = influence @ (motion.rho.swapaxes(1, 2) @ by_coordinate)  # (m, r, coordinates)
-    return [fit.acceleration_errors(motion.t, steps[:, :, k]) for k, fit in enumerate(equations.fits.values())]
+
+    t: Array
+    gains: Array
+    fits: Sequence[SplineFit]
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, regressor: TorqueRegressor, equations: _Equations, x: Array) -> _MotionErrors:
+        """Differentiate the equations with unknowns x at some instants, and interpolate between them."""
+        some = np.unique(np.linspace(0, len(equations.motion.t) - 1, MAX_DIFFERENTIATED).astype(int))
+        full, tau = equations.motion, equations.tau[some]
+        motion = replace(full, **{key: getattr(full, key)[some] for key in ("t", "q_tree", "v_tree", "a_tree", "rho")})
+
+        def residual(at: MeasuredMotion) -> Array:
+            columns, force = regressor.rows(at)
+            return _generalized(mechanism, at, tau) - force - columns @ (regressor.scale * x)
+
+        before = residual(motion)
+        gains = np.zeros((3, len(full.t), before.shape[1], len(equations.fits)))
+        for k, (name, fit) in enumerate(equations.fits.items()):
+            smallest = MIN_SHIFT * mechanism.tree.step_scale[mechanism.tree.index[name]]
+            for order in range(3):
+                shift = max(fit.std[order], smallest / fit.interval**order)
+                shifted = residual(shift_motion(mechanism, motion, equations.fits, order, name, shift))
+                for i, column in enumerate((shifted - before).T / shift):
+                    gains[order, :, i, k] = np.interp(full.t, motion.t, column)
+        return cls(full.t, gains, list(equations.fits.values()))
+
+    def steps(self, influence: Array) -> list[Array]:
+        """Return the steps (r, any) of a solution with such influence (m, r, d), of unit variance each."""
+        return [
+            fit.errors(self.t, np.einsum("krd,okd->okr", influence, self.gains[..., k]))
+            for k, fit in enumerate(self.fits)
+        ]
+
+    def covariance(self, lag: int) -> Array:
+        """Return the mean covariance (d, d) at two instants that are `lag` apart."""
+        first = np.unique(np.linspace(0, len(self.t) - 1 - lag, MAX_COMPARED).astype(int))
+        total = np.zeros((self.gains.shape[2],) * 2)
+        for k, fit in enumerate(self.fits):
+            one, other = (self._at(at, k, fit) for at in (first, first + lag))
+            total += np.einsum("kic,kjc->ij", one, other) / len(first)
+        return (total + total.T) / 2
+
+    def _at(self, at: Array, k: int, fit: SplineFit) -> Array:
+        """Return the errors (instants, d, any) that errors of one spline cause at some instants."""
+        gains = self.gains[..., k][:, at]
+        apart = np.einsum("okd,kl->okld", gains, np.eye(len(at))).reshape(3, len(at), -1)
+        return fit.errors(self.t[at], apart).reshape(len(at), gains.shape[2], -1)
 
 
 def _prediction(equations: _Equations, motors: Sequence[str], step: Array, fit: LinearFit) -> Prediction:

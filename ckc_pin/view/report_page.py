@@ -56,20 +56,20 @@ def _overview(result: Identification) -> str:
 
 
 def _parameters(result: Identification) -> str:
-    rows = [
-        [
-            escape(name),
-            "" if x.value is None else _number(x.value, x.std),
-            "" if x.std is None else f"{x.std:.2g}",
-            f"{x.start:.6g}",
-            escape(x.verdict),
-            escape(x.missing or ""),
-        ]
-        for name, x in result.parameters.items()
-    ]
-    return _table(
-        ["parameter", "value", "std", "start", "verdict", "without a value, because"], rows, numbers=(1, 2, 3)
-    )
+    """Return a table of the parameters with a value, and one of the others by reason."""
+    rows, others = [], dict[tuple[str, str], list[str]]()
+    for name, x in result.parameters.items():
+        if x.value is None:
+            others.setdefault((x.verdict, x.missing or ""), []).append(name)
+            continue
+        std = "" if x.std is None else f"{x.std:.2g}"
+        rows.append([escape(name), _number(x.value, x.std), std, f"{x.start:.6g}", escape(x.verdict)])
+    parts = [_table(["parameter", "value", "std", "start", "verdict"], rows, numbers=(1, 2, 3))] if rows else []
+    if others:
+        grouped = [[escape(verdict), escape(reason), escape(", ".join(names))]
+                   for (verdict, reason), names in others.items()]  # fmt: skip
+        parts.append(_table(["without a value", "because", "parameters"], grouped))
+    return "\n".join(parts)
 
 
 def _combinations(result: Identification) -> str:
@@ -103,7 +103,7 @@ def _number(value: float, std: float | None) -> str:
     return f"{value:.{digits}g}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int]) -> str:
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> str:
     """Return a table of escaped cells."""
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
     body = "\n".join(

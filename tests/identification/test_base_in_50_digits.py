@@ -1,69 +1,98 @@
-"""Base parameters of a slider-crank against singular values in 50 digits, of equations of the test's own.
+"""Base parameters against singular values in 50 digits, of equations of the test's own.
 
-With one freedom, tau = M q'' + M' q'^2 / 2 + V'. M and V are linear in mass, first moment and inertia of each link.
+The generalized forces of planar links follow from Newton and Euler's equations and virtual work. They are linear in
+mass, first moment and inertia of each link.
 """
 
 from __future__ import annotations
 
 import mpmath as mp
 import numpy as np
+import pytest
 
 from ckc_pin import load
 from ckc_pin.identification.pseudo_inertia import MOMENTS
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.structure import structural_directions
 
-CRANK, ROD, GRAVITY = mp.mpf("0.1"), mp.mpf("0.3"), mp.mpf("9.81")
+GRAVITY = mp.mpf("9.81")
 PLANAR = ("mass", "moment.x", "moment.y", "origin_inertia.izz")
-LINKS = ("crank_link", "rod_link", "slider_link")
 
 
-def rod_angle(q):
-    return -mp.asin(CRANK * mp.sin(q) / ROD)
+def slider_crank_places(q):
+    """Return x, y and angle of the frames of crank, rod and slider."""
+    crank, rod = mp.mpf("0.1"), mp.mpf("0.3")
+    x, y = crank * mp.cos(q), crank * mp.sin(q)
+    angle = -mp.asin(y / rod)
+    return 0, 0, q, x, y, angle, x + rod * mp.cos(angle), 0, 0
 
 
-PLACES = (  # x, y and angle of each link's frame
-    (lambda q: mp.mpf(0), lambda q: mp.mpf(0), lambda q: q),
-    (lambda q: CRANK * mp.cos(q), lambda q: CRANK * mp.sin(q), rod_angle),
-    (lambda q: CRANK * mp.cos(q) + ROD * mp.cos(rod_angle(q)), lambda q: mp.mpf(0), lambda q: mp.mpf(0)),
-)
+def five_bar_places(left, right):
+    """Return x, y and angle of the frames of link_1 to link_4, with the tip below the elbows."""
+    proximal, distal, base = mp.mpf("0.2794"), mp.mpf("0.3048"), mp.mpf("0.3048")
+    x, y = proximal * mp.cos(left), proximal * mp.sin(left)
+    right_x, right_y = base + proximal * mp.cos(right), proximal * mp.sin(right)
+    turn, half = mp.atan2(right_y - y, right_x - x), mp.hypot(right_x - x, right_y - y) / 2
+    below = mp.acos(half / distal)
+    return 0, 0, left, x, y, turn - below, base, 0, right, right_x, right_y, turn + below - mp.pi
 
 
-def column(place, number, q, rate, acceleration):
-    """Return the crank's torque for a unit of one number of a link."""
-    x, y, angle = place
-
-    def mass(s):
-        dx, dy, turn = (mp.diff(f, s) for f in (x, y, angle))
-        a = angle(s)
-        return {"mass": dx**2 + dy**2, "moment.x": 2 * turn * (dy * mp.cos(a) - dx * mp.sin(a)),
-                "moment.y": -2 * turn * (dx * mp.cos(a) + dy * mp.sin(a)),
-                "origin_inertia.izz": turn**2}[number]  # fmt: skip
-
-    def height(s):
-        values = {"mass": y(s), "moment.x": mp.sin(angle(s)), "moment.y": mp.cos(angle(s))}
-        return GRAVITY * values.get(number, mp.mpf(0))
-
-    return mass(q) * acceleration + mp.diff(mass, q) * rate**2 / 2 + mp.diff(height, q)
+CASES = {
+    "slider_crank": (slider_crank_places, ("crank_link", "rod_link", "slider_link"), (0.0,), 2.0),
+    "five_bar": (five_bar_places, ("link_1", "link_2", "link_3", "link_4"), (-1.434, -1.707), 0.5),
+}
 
 
-def test_rank_and_space_equal_those_in_50_digits():
-    regressor = TorqueRegressor(load("slider_crank"), ["link.*.inertial"])
-    assert regressor.links == list(LINKS)
+def rows_of(places, q, rates, accelerations):
+    """Return the generalized forces (d rows) of a unit of each number of each link."""
+    d, count = len(q), len(places(*q))
+
+    def derivative(k, *along):
+        orders = tuple(along.count(i) for i in range(d))
+        return mp.diff(lambda *x: mp.mpf(places(*x)[k]), q if d > 1 else q[0], orders if d > 1 else orders[0])
+
+    first = [[derivative(k, i) for i in range(d)] for k in range(count)]
+    second = [
+        sum(first[k][i] * accelerations[i] for i in range(d))
+        + sum(derivative(k, i, j) * rates[i] * rates[j] for i in range(d) for j in range(d))
+        for k in range(count)
+    ]
+    rows = [[] for _ in range(d)]
+    for k in range(0, count, 3):
+        angle = places(*q)[k + 2]
+        rate = sum(first[k + 2][i] * rates[i] for i in range(d))
+        a_x, a_y, turning = second[k], second[k + 1] + GRAVITY, second[k + 2]
+        moments = {"moment.x": (mp.cos(angle), mp.sin(angle)), "moment.y": (-mp.sin(angle), mp.cos(angle))}
+        loads = [(a_x, a_y, mp.mpf(0))]  # force and torque about the frame's origin
+        loads += [(-turning * y - rate**2 * x, turning * x - rate**2 * y, x * a_y - y * a_x)
+                  for x, y in moments.values()]  # fmt: skip
+        loads.append((mp.mpf(0), mp.mpf(0), turning))
+        for i in range(d):
+            rows[i] += [sum(load[j] * first[k + j][i] for j in range(3)) for load in loads]
+    return rows
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rank_and_space_equal_those_in_50_digits(name):
+    places, links, middle, reach = CASES[name]
+    regressor = TorqueRegressor(load(name), ["link.*.inertial"])
+    assert regressor.links == list(links)
+    d, random = len(middle), np.random.default_rng(0)
     with mp.workdps(50):
-        states = [
-            [mp.mpf(int(x)) / 1000 for x in row] for row in np.random.default_rng(0).integers(-2000, 2000, (24, 3))
-        ]
-        rows = mp.matrix([[column(place, number, *state) for place in PLACES for number in PLANAR] for state in states])
-        gram = rows.T * rows
-        values, vectors = mp.eigsy(gram)
+        rows = []
+        for _ in range(24):
+            q, rates, accelerations = (
+                [mp.mpf(int(1000 * x)) / 1000 for x in row]
+                for row in (middle + random.uniform(-reach, reach, d), *random.uniform(-2, 2, (2, d)))
+            )
+            rows += rows_of(places, q, rates, accelerations)
+        values, vectors = mp.eigsy(mp.matrix(rows).T * mp.matrix(rows))
         rank = sum(x > mp.mpf(10) ** -25 * max(values) for x in values)
         null = np.array([[float(vectors[i, k]) for k in range(len(values) - rank)] for i in range(len(values))])
-    names = [f"link.{link}.{number}" for link in LINKS for number in PLANAR]
-    at = [regressor.names.index(name) for name in names]
+    at = [regressor.names.index(f"link.{link}.{number}") for link in links for number in PLANAR]
     directions = structural_directions(regressor)
     assert directions.shape[1] == rank
-    assert len(MOMENTS) * len(LINKS) == len(directions)
+    assert len(MOMENTS) * len(links) == len(directions)
     # Vectors without influence in 50 digits are orthogonal to all directions with influence, and the ranks are equal.
     scaled = null / regressor.scale[at, None]
     scaled /= np.linalg.norm(scaled, axis=0)

@@ -203,10 +203,10 @@ BAD = [
     ({"method": "motion", "physical": False}, "simulates runs, which need inertias that some body can have"),
     ({"parameters": ["motor.*.offset"]}, "there are link.*.inertial, gravity.x, gravity.y"),
     ({"parameters": ["joint.theta_1.fricton"]}, "did you mean 'joint.theta_1.friction'"),
-    ({"drop": "theta_3"}, "no column theta_1, theta_3; 2 coordinates and the torques of all motors or of none"),
+    ({"drop": "theta_3"}, "no column theta_3; 2 coordinates and the torques of all motors or of none"),
     ({"drop": "tau.theta_3"}, "no column tau.theta_3; 2 coordinates and the torques of all motors or of none"),
-    ({"offset": 2.0}, "of another branch or another mechanism"),
-    ({"rows": 13}, "measurements for 44 unknowns; record a longer motion"),
+    ({"offset": 2.0}, "do not let the mechanism follow the measured coordinates; they are of another branch"),
+    ({"rows": 20}, "measurements for 44 unknowns; record a longer motion"),
 ]  # fmt: skip
 
 
