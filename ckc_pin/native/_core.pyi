@@ -835,3 +835,23 @@ class Feedback:
         """
         Return the force on the tree and its derivatives by q' and v'; a reason if there is no force; None if the derivatives are unknown.
         """
+
+class ManyInstants:
+    """Evaluates a CasADi function at many instants."""
+
+    def __init__(
+        self,
+        operations: Sequence[str],
+        to: Sequence[int],
+        a: Sequence[int],
+        b: Sequence[int],
+        *,
+        constants: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        numbers: int,
+        argument_sizes: Sequence[int],
+        result_sizes: Sequence[int],
+    ) -> None: ...
+    def evaluate(
+        self, arguments: list[numpy.typing.NDArray[numpy.float64]], results: list[numpy.typing.NDArray[numpy.float64]]
+    ) -> None:
+        """Write results (instants, entries) at arguments (instants, entries)."""

@@ -19,6 +19,7 @@ from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
+from ckc_pin.native import _core
 
 __all__ = ["Derivatives", "MotionInstants", "ReducedDynamics", "evaluate_many"]
 
@@ -27,7 +28,6 @@ MAX_FOLLOWED_STEP = 0.2  # rad, or sizes of the mechanism: from a configuration 
 MAX_NEWTON_STEPS = 12
 MAX_NEWTON_STEP = 1.0  # rad, or sizes of the mechanism
 MAX_PIECES = 64  # of a step of q
-BLOCKS = (8, 128)  # instants that are evaluated in one call
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,26 +320,46 @@ def evaluate_many(function: Any, *columns: Array) -> list[Array]:
     -------
     list of (m, rows, columns) arrays
     """
-    count = len(columns[0])
-    size = next((size for size in BLOCKS if size >= count), BLOCKS[-1])
-    padded = -(-count // size) * size
-    inputs = [np.ascontiguousarray(np.concatenate([x, np.repeat(x[-1:], padded - count, axis=0)])) for x in columns]
-    outputs = [np.empty((padded, function.size2_out(k), function.size1_out(k))) for k in range(function.n_out())]
-    buffer, evaluate = _block(function, size)
-    for begin in range(0, padded, size):
-        for k, x in enumerate(inputs):
-            buffer.set_arg(k, x[begin : begin + size].data)
-        for k, y in enumerate(outputs):
-            buffer.set_res(k, y[begin : begin + size].data)
-        evaluate()
-    return [y[:count].transpose(0, 2, 1) for y in outputs]
+    shapes = [(function.size2_out(k), function.size1_out(k)) for k in range(function.n_out())]
+    results = [np.empty((len(columns[0]), rows * size)) for rows, size in shapes]
+    _many_instants(function).evaluate([np.ascontiguousarray(x, dtype=float) for x in columns], results)
+    return [x.reshape(len(x), *shape).transpose(0, 2, 1) for x, shape in zip(results, shapes, strict=True)]
 
 
 @cache
-def _block(function: Any, size: int) -> tuple[Any, Any]:
-    """Return the buffer of a function that evaluates `size` instants, and how to call it."""
-    buffer, evaluate = function.map(size).buffer()
-    return buffer, evaluate
+def _many_instants(function: Any) -> _core.ManyInstants:
+    """Return the evaluator of a CasADi function."""
+    import casadi as cs
+
+    names = {
+        cs.OP_CONST: "constant", cs.OP_INPUT: "input", cs.OP_OUTPUT: "output", cs.OP_ASSIGN: "copy", cs.OP_ADD: "add",
+        cs.OP_SUB: "subtract", cs.OP_MUL: "multiply", cs.OP_DIV: "divide", cs.OP_NEG: "negate", cs.OP_SQ: "square",
+        cs.OP_TWICE: "twice", cs.OP_INV: "invert", cs.OP_SQRT: "square_root", cs.OP_SIN: "sine", cs.OP_COS: "cosine",
+        cs.OP_TAN: "tangent", cs.OP_ATAN2: "arcus_tangent", cs.OP_FABS: "absolute", cs.OP_LT: "less",
+        cs.OP_LE: "less_or_equal", cs.OP_EQ: "equal", cs.OP_NE: "unequal", cs.OP_NOT: "inverse_truth",
+        cs.OP_AND: "both", cs.OP_OR: "either", cs.OP_IF_ELSE_ZERO: "if_else_zero", cs.OP_FMIN: "smaller",
+        cs.OP_FMAX: "larger", cs.OP_POW: "power", cs.OP_CONSTPOW: "power",
+    }  # fmt: skip
+    operations: list[str] = []
+    places: list[tuple[int, int, int]] = []
+    constants: list[float] = []
+    for k in range(function.n_instructions()):
+        code = function.instruction_id(k)
+        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        operations.append(names.get(code, f"CasADi's {code}"))
+        if code == cs.OP_CONST:
+            places.append((outputs[0], len(constants), 0))
+            constants.append(function.instruction_constant(k))
+        elif code == cs.OP_OUTPUT:
+            places.append((outputs[0], inputs[0], outputs[1]))
+        else:
+            places.append((outputs[0], inputs[0], inputs[-1]))
+    to, a, b = ([place[k] for place in places] for k in range(3))
+    return _core.ManyInstants(
+        operations, to, a, b, constants=np.array(constants), numbers=function.sz_w(),
+        argument_sizes=[function.numel_in(k) for k in range(function.n_in())],
+        result_sizes=[function.numel_out(k) for k in range(function.n_out())],
+    )  # fmt: skip
 
 
 def _function(inputs: list[Any], outputs: list[Any]) -> Any:

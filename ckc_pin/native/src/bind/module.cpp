@@ -11,4 +11,5 @@ NB_MODULE(_core, m) {
   ckc::bind_gate(m);
   ckc::bind_batch(m);
   ckc::bind_linearization(m);
+  ckc::bind_many(m);
 }

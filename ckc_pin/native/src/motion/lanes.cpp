@@ -3,17 +3,12 @@
 #include <algorithm>
 #include <cmath>
 
+#include "tree/widest_registers.hpp"
+
 namespace ckc {
 
 // With fewer members, computing each alone takes less time.
 constexpr int min_members = 3;
-
-// The loops over lanes below are compiled several times, and the processor's version is taken at run time.
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
-#define WITH_WIDEST_REGISTERS __attribute__((target_clones("default", "avx2", "avx512f")))
-#else
-#define WITH_WIDEST_REGISTERS
-#endif
 
 namespace {
 

@@ -1,0 +1,9 @@
+// Functions whose loops are compiled several times, for processors with wider vector registers. The version of the
+// processor is taken when the library is loaded; sums and products are not fused, so that all versions have the same digits.
+#pragma once
+
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
+#define WITH_WIDEST_REGISTERS __attribute__((target_clones("default", "avx2", "avx512f")))
+#else
+#define WITH_WIDEST_REGISTERS
+#endif
