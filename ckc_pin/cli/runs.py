@@ -47,6 +47,7 @@ __all__ = ["format_profile", "play", "plot", "run"]
         "ckc run five_bar/tracking --out runs/spf",
         "ckc run five_bar/tracking --set formulation=reduced --set solver.rtol=1e-10 --json",
         "ckc run five_bar/tracking --csv tracking.csv",
+        "ckc run delta --mcap delta.mcap",
         "ckc run five_bar/tracking --meshcat --speed 1",
         "ckc run . --out first --figures",
     )
@@ -61,6 +62,12 @@ __all__ = ["format_profile", "play", "plot", "run"]
 @options.out(help="Folder for run.npz and for scene.json, the scene with all defaults.")
 @options.figures
 @options.csv(help="Also write the run as a CSV file, a row for each output instant; columns are named quantities.")
+@click.option(
+    "--mcap",
+    metavar="FILE",
+    type=options.PATH,
+    help="Also write joint states, frames and wrenches for Foxglove and ROS 2.",
+)
 @click.option("--profile", is_flag=True, help="Print how often each term was evaluated and the time it took.")
 @click.option(
     "--meshcat", is_flag=True, help="Show the simulation in the browser, then play it back; Ctrl-C ends the command."
@@ -77,6 +84,7 @@ def run(
     out: Path | None,
     figures: bool,
     csv: Path | None,
+    mcap: Path | None,
     profile: bool,
     meshcat: bool,
     speed: float | None,
@@ -96,6 +104,7 @@ def run(
     if out is not None:
         make_folder(out)
     require_file_path(csv, "--csv")
+    require_file_path(mcap, "--mcap")
     with ExitStack() as stack:
         view = stack.enter_context(_open_live_view(scene, speed, port, open_browser)) if meshcat else None
         with ProgressBar(scene.name) as progress:
@@ -103,7 +112,7 @@ def run(
             finished = ckc_pin.simulate(scene, progress=progress, on_output=on_output, profile=profile)
         finished = finished.with_warnings(warnings)
         code = _save_and_print(finished, out, figures, profile, as_json, warnings)
-        _write_csv(finished, csv, as_json)
+        _write_files(finished, csv, mcap, as_json)
         if view is not None and finished.status != "interrupted":
             try:
                 view.finish(finished, stay=True)
@@ -136,8 +145,13 @@ def _save_and_print(
     return DONE if stop is None else interrupt_code(str(stop))
 
 
-def _write_csv(finished: ckc_pin.Run, csv: Path | None, as_json: bool) -> None:
+def _write_files(finished: ckc_pin.Run, csv: Path | None, mcap: Path | None, as_json: bool) -> None:
     write_csv(finished, csv, as_json)
+    if mcap is not None:
+        with interrupts.deferred():
+            finished.to_mcap(mcap)
+        if not as_json:
+            print_written([mcap])
     sys.stdout.flush()  # A live view may keep the command running.
 
 
