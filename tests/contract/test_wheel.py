@@ -33,4 +33,10 @@ def test_a_wheel_has_the_package_and_the_mechanisms_alone(tmp_path: Path) -> Non
     for room in ("explorer", "view"):
         static = {file.name for file in code if file.parts[1:3] == (room, "static")}
         assert static == {path.name for path in (ROOT / "ckc_pin" / room / "static").iterdir()}
+    for form in ("c", "fmu"):
+        templates = {file for file in code if file.parts[1:4] == ("formats", form, "templates")}
+        assert {x.name for x in templates} == {
+            path.name for path in (ROOT / "ckc_pin" / "formats" / form / "templates").iterdir()
+        }
+        code -= templates
     assert {file.suffix for file in code} <= {".py", ".pyi", ".typed", ".html", ".js", ".css"}
