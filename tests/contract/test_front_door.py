@@ -267,7 +267,7 @@ def test_placeholders_in_help_have_one_style(name: str) -> None:
     assert ("--help", "") in shown
     for option, value in shown:
         assert value not in {"TEXT", "INTEGER", "FLOAT", "PATH", "FOLDER", "DIRECTORY", "FILENAME"}, option
-        assert re.fullmatch(r"|[A-Z]+(=[A-Z]+|,[A-Z])?|\[[a-z|]+\]", value), (option, value)
+        assert re.fullmatch(r"|[A-Z]+(=[A-Z]+|,[A-Z])?|\[[a-z0-9.|]+\]", value), (option, value)
         if option in ("--out", "--meshes"):
             assert value == "DIR"
 
