@@ -148,8 +148,10 @@ def _save_and_print(
 def _write_files(finished: ckc_pin.Run, csv: Path | None, mcap: Path | None, as_json: bool) -> None:
     write_csv(finished, csv, as_json)
     if mcap is not None:
+        from ckc_pin.formats.mcap import write_mcap
+
         with interrupts.deferred():
-            finished.to_mcap(mcap)
+            write_mcap(finished, mcap)
         if not as_json:
             print_written([mcap])
     sys.stdout.flush()  # A live view may keep the command running.

@@ -25,8 +25,8 @@ WORLD = "world"
 WRENCH = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
-def write_mcap(run: Run, path: Path) -> None:
-    """Write a run as an MCAP file, a message of each topic for each output instant.
+def write_mcap(run: Run, path: str | Path) -> Path:
+    """Write a run as an MCAP file, a message of each topic for each output instant; return its path.
 
     - ``/joint_states``: position, velocity, and the motors' force on each joint that is one coordinate.
     - ``/tf``: placements of all links in the world.
@@ -39,6 +39,7 @@ def write_mcap(run: Run, path: Path) -> None:
     InputError
         rosbags is not installed, or the file cannot be written.
     """
+    path = Path(path)
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
@@ -56,6 +57,7 @@ def write_mcap(run: Run, path: Path) -> None:
         (written,) = bag.glob("*.mcap")
         with open_atomic(path) as file:
             file.write(written.read_bytes())
+    return path
 
 
 def _messages(run: Run, types: dict[str, Any]) -> Iterator[tuple[str, str, int, Any]]:

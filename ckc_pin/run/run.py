@@ -552,23 +552,6 @@ class Run(HasSummary):
         write_atomic(Path(path), to_csv_text("t", self.t, list_columns(self, columns)))
         return Path(path)
 
-    def to_mcap(self, path: str | Path) -> Path:
-        """Write the run as an MCAP file for Foxglove and the tools of rosbag2 (needs the extra `bags`).
-
-        Topics are ``/joint_states``, ``/tf`` with the links' placements, ``/joint_wrenches/JOINT``, and
-        ``/robot_description``.
-
-        Raises
-        ------
-        InputError
-            rosbags is not installed, or the file cannot be written.
-        """
-        from ckc_pin.formats.mcap import write_mcap
-
-        require_path(path, "Run.to_mcap: path")
-        write_mcap(self, Path(path))
-        return Path(path)
-
     # --- files -----------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import ckc_pin
 from ckc_pin.errors import InputError
+from ckc_pin.formats.mcap import write_mcap
 from tests.contract.helpers.command import ckc
 
 
@@ -31,7 +32,7 @@ def read(path: Path) -> dict[str, list[Any]]:
 def test_frames_are_those_of_the_urdf_at_the_joint_states(scene: str, tmp_path: Path) -> None:
     """Kinematics of yourdfpy, from nothing but the messages."""
     run = ckc_pin.simulate(scene, {"t_end": 0.1, "solver.output_dt": 0.05})
-    topics = read(run.to_mcap(tmp_path / "run.mcap"))
+    topics = read(write_mcap(run, tmp_path / "run.mcap"))
     ((_, description),) = topics["/robot_description"]
     robot = yourdfpy.URDF.load(StringIO(description.data), load_meshes=False, build_scene_graph=True)
     assert [at for at, _ in topics["/joint_states"]] == [round(1e9 * t) for t in run.t]
@@ -53,7 +54,7 @@ def rotation(x: float, y: float, z: float, w: float) -> Any:
 
 def test_joint_states_and_wrenches_are_the_quantities_of_the_run(tmp_path: Path) -> None:
     run = ckc_pin.simulate("two_ur5", {"t_end": 0.1, "solver.output_dt": 0.05})
-    topics = read(run.to_mcap(tmp_path / "run.mcap"))
+    topics = read(write_mcap(run, tmp_path / "run.mcap"))
     names = [name for name in run.mechanism.coordinates if not name.startswith("load_root.")]
     for k, (_, state) in enumerate(topics["/joint_states"]):
         assert state.name == names
@@ -90,5 +91,5 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     run = ckc_pin.simulate("five_bar/swing", {"t_end": 0.1})
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(InputError, match=r"writing MCAP files needs rosbags: pip install ckc_pin\[bags\]"):
-        run.to_mcap(tmp_path / "run.mcap")
+        write_mcap(run, tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
