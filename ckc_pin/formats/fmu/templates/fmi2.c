@@ -51,6 +51,11 @@ static fmi2Status report(const instance *c, fmi2Status status, const char *messa
   return status;
 }
 
+/* The status of a function that returns NULL or the reason of its failure. */
+static fmi2Status check(const instance *c, const char *reason) {
+  return reason == NULL ? fmi2OK : report(c, fmi2Error, reason);
+}
+
 static fmi2Status result(const instance *c, mech_status status, fmi2Status failure) {
   return status == MECH_OK ? fmi2OK : report(c, failure, REASON[status]);
 }
@@ -107,20 +112,12 @@ FMI2_Export fmi2Status fmi2Reset(fmi2Component c) {
 
 FMI2_Export fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference references[], size_t n,
                                    fmi2Real values[]) {
-  for (size_t k = 0; k < n; ++k) {
-    const char *reason = fmu_get(&((instance *)c)->state, references[k], &values[k]);
-    if (reason != NULL) return report(c, fmi2Error, reason);
-  }
-  return fmi2OK;
+  return check(c, fmu_get(&((instance *)c)->state, references, n, values));
 }
 
 FMI2_Export fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference references[], size_t n,
                                    const fmi2Real values[]) {
-  for (size_t k = 0; k < n; ++k) {
-    const char *reason = fmu_set(&((instance *)c)->state, references[k], values[k]);
-    if (reason != NULL) return report(c, fmi2Error, reason);
-  }
-  return fmi2OK;
+  return check(c, fmu_set(&((instance *)c)->state, references, n, values));
 }
 
 /* There are no variables of other types. */
@@ -137,10 +134,7 @@ OTHER_TYPE(Boolean)
 OTHER_TYPE(String)
 
 FMI2_Export fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-  if (*state == NULL) *state = malloc(sizeof(fmu));
-  if (*state == NULL) return report(c, fmi2Error, "there is no memory for the state");
-  memcpy(*state, &((instance *)c)->state, sizeof(fmu));
-  return fmi2OK;
+  return check(c, fmu_copy(&((instance *)c)->state, state));
 }
 
 FMI2_Export fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
@@ -149,12 +143,7 @@ FMI2_Export fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
 }
 
 FMI2_Export fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-  (void)c;
-  if (state != NULL) {
-    free(*state);
-    *state = NULL;
-  }
-  return fmi2OK;
+  return (void)c, fmu_free_copy(state), fmi2OK;
 }
 
 FMI2_Export fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
@@ -164,17 +153,12 @@ FMI2_Export fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate 
 }
 
 FMI2_Export fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
-  if (size < sizeof(fmu)) return report(c, fmi2Error, "the buffer is smaller than the state");
-  memcpy(bytes, state, sizeof(fmu));
-  return fmi2OK;
+  return check(c, fmu_serialize(state, bytes, size));
 }
 
 FMI2_Export fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
                                                fmi2FMUstate *state) {
-  if (size < sizeof(fmu)) return report(c, fmi2Error, "these bytes are not a state of this FMU");
-  const fmi2Status status = fmi2GetFMUstate(c, state);
-  if (status == fmi2OK) memcpy(*state, bytes, sizeof(fmu));
-  return status;
+  return check(c, fmu_deserialize(bytes, size, state));
 }
 
 FMI2_Export fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[], size_t n,
@@ -209,13 +193,11 @@ FMI2_Export fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) {
 }
 
 FMI2_Export fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real states[], size_t n) {
-  if (n != STATES) return report(c, fmi2Error, "wrong number of states");
-  fmu_set_states(&((instance *)c)->state, states);
-  return fmi2OK;
+  return check(c, fmu_set_states(&((instance *)c)->state, states, n));
 }
 
 FMI2_Export fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t n) {
-  if (n != STATES) return report(c, fmi2Error, "wrong number of states");
+  if (n != STATES) return report(c, fmi2Error, WRONG_NUMBER);
   return result(c, fmu_get_derivatives(&((instance *)c)->state, derivatives), fmi2Discard);
 }
 
@@ -225,9 +207,7 @@ FMI2_Export fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real indicato
 }
 
 FMI2_Export fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real states[], size_t n) {
-  if (n != STATES) return report(c, fmi2Error, "wrong number of states");
-  fmu_get_states(&((instance *)c)->state, states);
-  return fmi2OK;
+  return check(c, fmu_get_states(&((instance *)c)->state, states, n));
 }
 
 FMI2_Export fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real nominals[], size_t n) {

@@ -57,6 +57,11 @@ static fmi3Status report(const instance *c, fmi3Status status, const char *messa
   return status;
 }
 
+/* The status of a function that returns NULL or the reason of its failure. */
+static fmi3Status check(const instance *c, const char *reason) {
+  return reason == NULL ? fmi3OK : report(c, fmi3Error, reason);
+}
+
 static fmi3Status result(const instance *c, mech_status status, fmi3Status failure) {
   return status == MECH_OK ? fmi3OK : report(c, failure, REASON[status]);
 }
@@ -147,21 +152,13 @@ NOTHING_TO_DO(fmi3Terminate)
 FMI3_Export fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference r[], size_t n, fmi3Float64 values[],
                                       size_t size) {
   if (n != size) return report(c, fmi3Error, "all variables are scalars");
-  for (size_t k = 0; k < n; ++k) {
-    const char *reason = fmu_get(&((instance *)c)->state, r[k], &values[k]);
-    if (reason != NULL) return report(c, fmi3Error, reason);
-  }
-  return fmi3OK;
+  return check(c, fmu_get(&((instance *)c)->state, r, n, values));
 }
 
 FMI3_Export fmi3Status fmi3SetFloat64(fmi3Instance c, const fmi3ValueReference r[], size_t n,
                                       const fmi3Float64 values[], size_t size) {
   if (n != size) return report(c, fmi3Error, "all variables are scalars");
-  for (size_t k = 0; k < n; ++k) {
-    const char *reason = fmu_set(&((instance *)c)->state, r[k], values[k]);
-    if (reason != NULL) return report(c, fmi3Error, reason);
-  }
-  return fmi3OK;
+  return check(c, fmu_set(&((instance *)c)->state, r, n, values));
 }
 
 /* The standard asks for all functions. There are no variables of other types, and no clocks. */
@@ -250,10 +247,7 @@ FMI3_Export fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueR
 /* --- the state --- */
 
 FMI3_Export fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-  if (*state == NULL) *state = malloc(sizeof(fmu));
-  if (*state == NULL) return report(c, fmi3Error, "there is no memory for the state");
-  memcpy(*state, &((instance *)c)->state, sizeof(fmu));
-  return fmi3OK;
+  return check(c, fmu_copy(&((instance *)c)->state, state));
 }
 
 FMI3_Export fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
@@ -262,12 +256,7 @@ FMI3_Export fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
 }
 
 FMI3_Export fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
-  (void)c;
-  if (state != NULL) {
-    free(*state);
-    *state = NULL;
-  }
-  return fmi3OK;
+  return (void)c, fmu_free_copy(state), fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) {
@@ -277,17 +266,12 @@ FMI3_Export fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState s
 }
 
 FMI3_Export fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size) {
-  if (size < sizeof(fmu)) return report(c, fmi3Error, "the buffer is smaller than the state");
-  memcpy(bytes, state, sizeof(fmu));
-  return fmi3OK;
+  return check(c, fmu_serialize(state, bytes, size));
 }
 
 FMI3_Export fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
                                                fmi3FMUState *state) {
-  if (size < sizeof(fmu)) return report(c, fmi3Error, "these bytes are not a state of this FMU");
-  const fmi3Status status = fmi3GetFMUState(c, state);
-  if (status == fmi3OK) memcpy(*state, bytes, sizeof(fmu));
-  return status;
+  return check(c, fmu_deserialize(bytes, size, state));
 }
 
 /* --- model exchange --- */
@@ -314,13 +298,11 @@ FMI3_Export fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
 }
 
 FMI3_Export fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 states[], size_t n) {
-  if (n != STATES) return report(c, fmi3Error, "wrong number of states");
-  fmu_set_states(&((instance *)c)->state, states);
-  return fmi3OK;
+  return check(c, fmu_set_states(&((instance *)c)->state, states, n));
 }
 
 FMI3_Export fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 derivatives[], size_t n) {
-  if (n != STATES) return report(c, fmi3Error, "wrong number of states");
+  if (n != STATES) return report(c, fmi3Error, WRONG_NUMBER);
   return result(c, fmu_get_derivatives(&((instance *)c)->state, derivatives), fmi3Discard);
 }
 
@@ -330,9 +312,7 @@ FMI3_Export fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 indica
 }
 
 FMI3_Export fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 states[], size_t n) {
-  if (n != STATES) return report(c, fmi3Error, "wrong number of states");
-  fmu_get_states(&((instance *)c)->state, states);
-  return fmi3OK;
+  return check(c, fmu_get_states(&((instance *)c)->state, states, n));
 }
 
 FMI3_Export fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[], size_t n) {

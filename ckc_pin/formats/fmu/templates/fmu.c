@@ -1,6 +1,7 @@
 /* The FMU of @TITLE@, the same for both versions of the standard: variables, initialization, derivatives, outputs and
    co-simulation. Written by ckc_pin @VERSION@ (ckc export --to fmu). */
 #include <float.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "mech.c"
@@ -208,8 +209,9 @@ static int is_start_value(unsigned reference) {
   return (int)reference >= PARAMETER && (int)reference <= EPSILON;
 }
 
-/* Return NULL, or why a variable cannot be set. */
-static const char *fmu_set(fmu *x, unsigned reference, double value) {
+/* The functions below that return a text return NULL, or why they failed. */
+
+static const char *set_value(fmu *x, unsigned reference, double value) {
   const int is_input = (int)reference >= TORQUE && (int)reference < POSITION;
   if (!is_input && !is_start_value(reference)) return "only inputs, parameters and start values can be set";
   if (!is_input && !x->is_initializing) return "parameters and start values can only be set before the end of initialization";
@@ -220,12 +222,49 @@ static const char *fmu_set(fmu *x, unsigned reference, double value) {
   return NULL;
 }
 
-static const char *fmu_get(fmu *x, unsigned reference, double *value) {
+static const char *get_value(fmu *x, unsigned reference, double *value) {
   mech_status status = MECH_OK;
   if (reference >= VARIABLES) return "there is no variable with this value reference";
   if ((int)reference >= POSITION && !(x->is_initializing && is_start_value(reference))) status = fmu_compute_outputs(x);
   *value = x->values[reference];
   return status == MECH_OK ? NULL : REASON[status];
+}
+
+static const char *fmu_set(fmu *x, const unsigned *references, size_t n, const double *values) {
+  const char *reason = NULL;
+  for (size_t k = 0; k < n && reason == NULL; ++k) reason = set_value(x, references[k], values[k]);
+  return reason;
+}
+
+static const char *fmu_get(fmu *x, const unsigned *references, size_t n, double *values) {
+  const char *reason = NULL;
+  for (size_t k = 0; k < n && reason == NULL; ++k) reason = get_value(x, references[k], &values[k]);
+  return reason;
+}
+
+/* --- copies of the FMU's state --- */
+
+static const char *fmu_copy(const void *state, void **copy) {
+  if (*copy == NULL) *copy = malloc(sizeof(fmu));
+  if (*copy == NULL) return "there is no memory for the state";
+  memcpy(*copy, state, sizeof(fmu));
+  return NULL;
+}
+
+static void fmu_free_copy(void **copy) {
+  if (copy == NULL) return;
+  free(*copy);
+  *copy = NULL;
+}
+
+static const char *fmu_serialize(const void *copy, void *bytes, size_t size) {
+  if (size < sizeof(fmu)) return "the buffer is smaller than the state";
+  memcpy(bytes, copy, sizeof(fmu));
+  return NULL;
+}
+
+static const char *fmu_deserialize(const void *bytes, size_t size, void **copy) {
+  return size < sizeof(fmu) ? "these bytes are not a state of this FMU" : fmu_copy(bytes, copy);
 }
 
 /* --- model exchange --- */
@@ -237,13 +276,19 @@ static int state_place(int k) {
   return IS_SPF ? POSITION + k : POSITION + INDEPENDENT[k];
 }
 
-static void fmu_get_states(const fmu *x, double *states) {
+static const char WRONG_NUMBER[] = "wrong number of states";
+
+static const char *fmu_get_states(const fmu *x, double *states, size_t n) {
+  if (n != STATES) return WRONG_NUMBER;
   for (int k = 0; k < STATES; ++k) states[k] = x->values[state_place(k)];
+  return NULL;
 }
 
-static void fmu_set_states(fmu *x, const double *states) {
+static const char *fmu_set_states(fmu *x, const double *states, size_t n) {
+  if (n != STATES) return WRONG_NUMBER;
   for (int k = 0; k < STATES; ++k) x->values[state_place(k)] = states[k];
   x->has_derivatives = 0;
+  return NULL;
 }
 
 static mech_status fmu_get_derivatives(fmu *x, double *derivatives) {
