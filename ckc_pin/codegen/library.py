@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,14 +29,10 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.rows import Curved, RelativeLog
 
-if TYPE_CHECKING:
-    from ckc_pin.codegen.term_functions import TermFunctions
-
 __all__ = [
     "Library",
     "cache_folder",
     "compile_terms",
-    "derive_term_functions",
     "explain_too_large",
     "find_compiled_terms",
 ]
@@ -266,6 +261,7 @@ def _make(
     import tempfile
 
     from ckc_pin.codegen.comparison import require_equal_terms
+    from ckc_pin.codegen.term_functions import TermFunctions
 
     folders = (Path(tempfile.gettempdir()), cache_folder())
     place = next((folder for folder in folders if folder.is_dir() and _allows_execution(folder)), None)
@@ -273,7 +269,7 @@ def _make(
         raise InputError(f"compiled terms cannot be loaded: neither {folders[0]} nor {folders[1]} allows programs")
     with temporary_folder(place) as folder:
         source, library = folder / "terms.c", folder / "terms.so"
-        text = derive_term_functions(
+        text = TermFunctions.of(
             mechanism,
             subject.which,
             directional_derivatives=subject.directional_derivatives,
@@ -290,32 +286,6 @@ def _make(
         content = library.read_bytes()
         name = f"{subject.key}-{compiler.key}-{sha256(content).hexdigest()[:32]}.so"
         return Library(str(_store(name, content)), subject.parameters)
-
-
-def derive_term_functions(
-    mechanism: Mechanism,
-    which: Mapping[str, BoolArray] | None = None,
-    *,
-    directional_derivatives: bool = False,
-    of_members: bool = False,
-    portable: bool = False,
-) -> TermFunctions:
-    """Derive a mechanism's term functions, arguments as in `TermFunctions.of`.
-
-    Raises
-    ------
-    InputError
-        CasADi is not installed.
-    """
-    try:
-        from ckc_pin.codegen.term_functions import TermFunctions
-
-        return TermFunctions.of(
-            mechanism, which, directional_derivatives=directional_derivatives, of_members=of_members, portable=portable
-        )
-    except ModuleNotFoundError as error:
-        message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"
-        raise InputError(message) from error
 
 
 def _store(name: str, content: bytes) -> Path:

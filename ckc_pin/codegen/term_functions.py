@@ -12,6 +12,7 @@ from ckc_pin.codegen.branches import Lanes, assign_argument_lanes, find_identica
 from ckc_pin.codegen.c_source import LaneMap, split_column, trace_result_lanes, write_c_source
 from ckc_pin.codegen.derivatives import derivative_functions
 from ckc_pin.codegen.expressions import TermExpressions, term_expressions
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 
 __all__ = ["FUNCTIONS", "PORTABLE_FUNCTIONS", "TermFunctions"]
@@ -96,9 +97,17 @@ class TermFunctions:
             Whether to add the acceleration of several members at a time.
         portable : bool
             Whether to derive `PORTABLE_FUNCTIONS`, for code without vectors of identical branches.
-        """
-        import casadi as cs
 
+        Raises
+        ------
+        InputError
+            CasADi is not installed.
+        """
+        try:
+            import casadi as cs
+        except ModuleNotFoundError as error:
+            message = "compiled terms need CasADi, which is not installed: pip install ckc_pin[symbolic]"
+            raise InputError(message) from error
         lanes = dict(find_identical_branches(mechanism.tree))
         terms = term_expressions(mechanism, which, () if portable else group_roots(mechanism.tree, lanes))
         table = PORTABLE_FUNCTIONS if portable else FUNCTIONS

@@ -13,7 +13,8 @@ import numpy as np
 from ckc_pin.codegen.arguments import argument_names, argument_units, present, values
 from ckc_pin.codegen.c_source import count_operations, write_static_function
 from ckc_pin.codegen.comparison import TERMS_TOLERANCE
-from ckc_pin.codegen.library import derive_term_functions, explain_too_large
+from ckc_pin.codegen.library import explain_too_large
+from ckc_pin.codegen.term_functions import TermFunctions
 from ckc_pin.dynamics.formulations import MIN_PIVOT
 from ckc_pin.errors import InputError
 from ckc_pin.formats.c.names import comment, identifiers, initializer, table
@@ -70,7 +71,7 @@ def fill_templates(
     more : mapping, optional
         Further texts, which replace ``@KEY@``.
     """
-    functions = derive_term_functions(mechanism, portable=True).functions
+    functions = TermFunctions.of(mechanism, portable=True).functions
     enumerators = _enumerators(mechanism, prefix)
     substitutions = {
         **_sizes(mechanism, functions),
