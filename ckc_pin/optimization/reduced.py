@@ -8,7 +8,7 @@ follow from the implicit function theorem.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,9 @@ from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
-from ckc_pin.native import _core
+from ckc_pin.optimization.many_instants import InstantsFunction
 
-__all__ = ["Derivatives", "MotionInstants", "ReducedDynamics", "evaluate_many"]
+__all__ = ["Derivatives", "MotionInstants", "ReducedDynamics"]
 
 MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism: of q between two closures
 MAX_FOLLOWED_STEP = 0.2  # rad, or sizes of the mechanism: from a configuration to those that are closed from it
@@ -117,7 +117,7 @@ class ReducedDynamics:
         self._passive = _function([q, v, a], [passive])
 
     @cached_property
-    def _first(self) -> Any:
+    def _first(self) -> InstantsFunction:
         """First derivatives of rows, their rates and accelerations, and of the forces' balance."""
         import casadi as cs
 
@@ -127,7 +127,7 @@ class ReducedDynamics:
         return _function(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
 
     @cached_property
-    def _second(self) -> Any:
+    def _second(self) -> InstantsFunction:
         """Second derivatives of a weighted sum of the same."""
         import casadi as cs
 
@@ -151,7 +151,7 @@ class ReducedDynamics:
         if not far < MAX_PIECES * MAX_CONTINUATION_STEP:
             return None
         count = 1 + int(far / MAX_CONTINUATION_STEP)
-        _, jacobian = evaluate_many(self._closure, q_tree)
+        _, jacobian = self._closure(q_tree)
         signs = np.sign(np.linalg.det(jacobian[:, :, self.z_in_tree]))
         for k in range(1, count + 1):
             target = start + (q - start) * (k / count)
@@ -190,11 +190,11 @@ class ReducedDynamics:
 
     def residual(self, q_tree: Array) -> Array:
         """Return phi of the independent rows and of quaternions' norms at configurations (m, nq), (m, rows)."""
-        return evaluate_many(self._closure, q_tree)[0][:, :, 0]
+        return self._closure(q_tree)[0][:, :, 0]
 
     def _newton(self, q_tree: Array) -> tuple[Array, Array] | None:
         for _ in range(MAX_NEWTON_STEPS):
-            phi, jacobian = evaluate_many(self._closure, q_tree)
+            phi, jacobian = self._closure(q_tree)
             size = np.abs(phi).max(initial=0.0)
             if not np.isfinite(size):
                 return None
@@ -218,7 +218,7 @@ class ReducedDynamics:
 
     def rho(self, q_tree: Array) -> Array:
         """Return rho of eq. 5 at closed configurations, (m, n, d)."""
-        J, _ = evaluate_many(self._rates, q_tree, np.zeros((len(q_tree), self.n)))
+        J, _ = self._rates(q_tree, np.zeros((len(q_tree), self.n)))
         return self._rho(J, _inverse(J[:, :, self.z_at]))
 
     def _rho(self, J: Array, inverse: Array) -> Array:
@@ -231,20 +231,20 @@ class ReducedDynamics:
         """Return smallest singular values of phi_z at configurations, relative to the first; 1 without loops."""
         if not len(self.z_at):
             return np.ones(len(q_tree))
-        J, _ = evaluate_many(self._rates, q_tree, np.zeros((len(q_tree), self.n)))
+        J, _ = self._rates(q_tree, np.zeros((len(q_tree), self.n)))
         smallest = np.linalg.svd(J[:, :, self.z_at], compute_uv=False)[:, -1]
         return smallest / smallest[0]
 
     def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
         """Return a motion at closed configurations with rates and accelerations (m, d) and torques (m, motors)."""
         v_tree, a_tree = np.zeros((2, len(q_tree), self.n))
-        J, _ = evaluate_many(self._rates, q_tree, v_tree)
+        J, _ = self._rates(q_tree, v_tree)
         inverse = _inverse(J[:, :, self.z_at])
         v_tree[:, self.q_at], a_tree[:, self.q_at] = v, a
         v_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], v))
-        _, J_dot_v = evaluate_many(self._rates, q_tree, v_tree)
+        _, J_dot_v = self._rates(q_tree, v_tree)
         a_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], a) + J_dot_v[:, :, 0])
-        (passive,) = evaluate_many(self._passive, q_tree, v_tree, a_tree)
+        (passive,) = self._passive(q_tree, v_tree, a_tree)
         force = passive[:, :, 0] - tau @ self.mechanism.motors.transmission
         multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
         missing = force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
@@ -255,7 +255,7 @@ class ReducedDynamics:
     def differentiate(self, at: MotionInstants) -> Derivatives:
         """Return the derivatives of a motion's quantities by q, q_dot, q_ddot and tau of each instant."""
         m, d, n, q_at, z_at = len(at.q_tree), self.d, self.n, self.q_at, self.z_at
-        blocks = evaluate_many(self._first, at.q_tree, at.v_tree, at.a_tree, at.multipliers)
+        blocks = self._first(at.q_tree, at.v_tree, at.a_tree, at.multipliers)
         phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = blocks
         size = 3 * d + self.motors
         inverse, J_q = _inverse(J[:, :, z_at]), J[:, :, q_at]
@@ -299,73 +299,18 @@ class ReducedDynamics:
         by_q = by_q if q_weights is None else by_q + q_weights
         inverse_q = _inverse(phi_q[:, :, self.z_in_tree])
         w_phi = -_times(inverse_q.transpose(0, 2, 1), by_q[:, self.z_in_tree])
-        qq, qv, vv, qa, ql = evaluate_many(
-            self._second, at.q_tree, at.v_tree, at.a_tree, at.multipliers, w_phi, w_rate, w_acceleration, w_balance
+        qq, qv, vv, qa, ql = self._second(
+            at.q_tree, at.v_tree, at.a_tree, at.multipliers, w_phi, w_rate, w_acceleration, w_balance
         )
         mixed = qq @ by_x.q_tree / 2 + qv @ by_x.v_tree + qa @ by_x.a_tree + ql @ by_x.multipliers
         half = by_x.q_tree.transpose(0, 2, 1) @ mixed + by_x.v_tree.transpose(0, 2, 1) @ (vv @ by_x.v_tree) / 2
         return half + half.transpose(0, 2, 1)
 
 
-def evaluate_many(function: Any, *columns: Array) -> list[Array]:
-    """Evaluate a CasADi function with dense outputs at many instants.
-
-    Parameters
-    ----------
-    function : casadi.Function
-    columns : (m, k) arrays
-        A row for each instant.
-
-    Returns
-    -------
-    list of (m, rows, columns) arrays
-    """
-    shapes = [(function.size2_out(k), function.size1_out(k)) for k in range(function.n_out())]
-    results = [np.empty((len(columns[0]), rows * size)) for rows, size in shapes]
-    _many_instants(function).evaluate([np.ascontiguousarray(x, dtype=float) for x in columns], results)
-    return [x.reshape(len(x), *shape).transpose(0, 2, 1) for x, shape in zip(results, shapes, strict=True)]
-
-
-@cache
-def _many_instants(function: Any) -> _core.ManyInstants:
-    """Return the evaluator of a CasADi function."""
+def _function(inputs: list[Any], outputs: list[Any]) -> InstantsFunction:
     import casadi as cs
 
-    names = {
-        cs.OP_CONST: "constant", cs.OP_INPUT: "input", cs.OP_OUTPUT: "output", cs.OP_ASSIGN: "copy", cs.OP_ADD: "add",
-        cs.OP_SUB: "subtract", cs.OP_MUL: "multiply", cs.OP_DIV: "divide", cs.OP_NEG: "negate", cs.OP_SQ: "square",
-        cs.OP_TWICE: "twice", cs.OP_INV: "invert", cs.OP_SQRT: "square_root", cs.OP_SIN: "sine", cs.OP_COS: "cosine",
-        cs.OP_TAN: "tangent", cs.OP_ATAN2: "arcus_tangent", cs.OP_FABS: "absolute", cs.OP_LT: "less",
-        cs.OP_LE: "less_or_equal", cs.OP_EQ: "equal", cs.OP_NE: "unequal", cs.OP_NOT: "inverse_truth",
-        cs.OP_AND: "both", cs.OP_OR: "either", cs.OP_IF_ELSE_ZERO: "if_else_zero", cs.OP_FMIN: "smaller",
-        cs.OP_FMAX: "larger", cs.OP_POW: "power", cs.OP_CONSTPOW: "power",
-    }  # fmt: skip
-    operations: list[str] = []
-    places: list[tuple[int, int, int]] = []
-    constants: list[float] = []
-    for k in range(function.n_instructions()):
-        code = function.instruction_id(k)
-        inputs, outputs = function.instruction_input(k), function.instruction_output(k)
-        operations.append(names.get(code, f"CasADi's {code}"))
-        if code == cs.OP_CONST:
-            places.append((outputs[0], len(constants), 0))
-            constants.append(function.instruction_constant(k))
-        elif code == cs.OP_OUTPUT:
-            places.append((outputs[0], inputs[0], outputs[1]))
-        else:
-            places.append((outputs[0], inputs[0], inputs[-1]))
-    to, a, b = ([place[k] for place in places] for k in range(3))
-    return _core.ManyInstants(
-        operations, to, a, b, constants=np.array(constants), numbers=function.sz_w(),
-        argument_sizes=[function.numel_in(k) for k in range(function.n_in())],
-        result_sizes=[function.numel_out(k) for k in range(function.n_out())],
-    )  # fmt: skip
-
-
-def _function(inputs: list[Any], outputs: list[Any]) -> Any:
-    import casadi as cs
-
-    return cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True})
+    return InstantsFunction(cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True}))
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

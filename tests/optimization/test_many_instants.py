@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.optimization.reduced import ReducedDynamics, evaluate_many
+from ckc_pin.optimization.many_instants import InstantsFunction
+from ckc_pin.optimization.reduced import ReducedDynamics
 
 
 def every_operation() -> Any:
@@ -30,7 +31,7 @@ def test_operations_are_those_of_casadi(count: int) -> None:
     function, random = every_operation(), np.random.default_rng(count)
     x, y = random.uniform(-1, 1, (count, 3)), random.uniform(-1, 1, (count, 2))
     x.setflags(write=False)
-    many = evaluate_many(function, x, y)
+    many = InstantsFunction(function)(x, y)
     assert [result.shape for result in many] == [(count, 27, 1), (count, 2, 2), (count, 0, 3)]
     for k in range(count):
         for ours, exact in zip(many, function(x[k], y[k]), strict=True):
@@ -39,9 +40,10 @@ def test_operations_are_those_of_casadi(count: int) -> None:
 
 def test_terms_of_a_mechanism_have_casadis_digits() -> None:
     dynamics, random = ReducedDynamics(ckc_pin.load("delta")), np.random.default_rng(1)
-    for function in (dynamics._closure, dynamics._rates, dynamics._passive, dynamics._first, dynamics._second):
+    for of_instants in (dynamics._closure, dynamics._rates, dynamics._passive, dynamics._first, dynamics._second):
+        function = of_instants.function
         columns = [random.uniform(-1, 1, (19, function.numel_in(k))) for k in range(function.n_in())]
-        many = evaluate_many(function, *columns)
+        many = of_instants(*columns)
         for k in range(19):
             exact = function(*(x[k] for x in columns))
             for ours, value in zip(many, exact if isinstance(exact, tuple) else [exact], strict=True):
@@ -51,4 +53,4 @@ def test_terms_of_a_mechanism_have_casadis_digits() -> None:
 def test_an_unknown_operation_is_named() -> None:
     x = cs.SX.sym("x")
     with pytest.raises(ValueError, match=r"operations: CasADi's .* is not supported"):
-        evaluate_many(cs.Function("f", [x], [cs.erf(x)]), np.zeros((2, 1)))
+        InstantsFunction(cs.Function("f", [x], [cs.erf(x)]))

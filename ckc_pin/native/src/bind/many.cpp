@@ -14,11 +14,17 @@ namespace {
 
 constexpr Eigen::Index width = 16;  // instants at a time
 
-enum class Operation {
-  constant, input, output, copy, add, subtract, multiply, divide, negate, square, twice, invert, square_root, sine, cosine,
-  tangent, arcus_tangent, absolute, less, less_or_equal, equal, unequal, inverse_truth, both, either, if_else_zero,
-  smaller, larger, power
-};
+// By name, in Python and here.
+#define OPERATIONS(X)                                                                                       \
+  X(constant) X(input) X(output) X(copy) X(add) X(subtract) X(multiply) X(divide) X(negate) X(square)        \
+  X(twice) X(invert) X(square_root) X(sine) X(cosine) X(tangent) X(arcus_tangent) X(absolute) X(less)        \
+  X(less_or_equal) X(equal) X(unequal) X(inverse_truth) X(both) X(either) X(if_else_zero) X(smaller)         \
+  X(larger) X(power)
+
+#define AS_ENUMERATOR(name) name,
+#define AS_TEXT(name) #name,
+enum class Operation { OPERATIONS(AS_ENUMERATOR) };
+constexpr const char* operation_names[] = {OPERATIONS(AS_TEXT)};
 
 struct alignas(64) Numbers {
   double x[width];
@@ -108,9 +114,9 @@ class ManyInstants {
     const size_t count = operations.size();
     require(to.size() == count && a.size() == count && b.size() == count, "operations: of other lengths");
     for (size_t k = 0; k < count; ++k) {
-      const auto name = std::find(std::begin(names), std::end(names), operations[k]);
-      require(name != std::end(names), "operations: " + operations[k] + " is not supported");
-      instructions_.push_back({static_cast<Operation>(name - std::begin(names)), to[k], a[k], b[k]});
+      const auto name = std::find(std::begin(operation_names), std::end(operation_names), operations[k]);
+      require(name != std::end(operation_names), "operations: " + operations[k] + " is not supported");
+      instructions_.push_back({static_cast<Operation>(name - std::begin(operation_names)), to[k], a[k], b[k]});
       check(instructions_.back());
     }
   }
@@ -132,12 +138,6 @@ class ManyInstants {
   }
 
  private:
-  static constexpr const char* names[] = {
-      "constant", "input",  "output",   "copy",          "add",  "subtract",      "multiply",  "divide",       "negate",
-      "square",   "twice",  "invert",   "square_root",   "sine", "cosine",        "tangent",   "arcus_tangent", "absolute",
-      "less",     "less_or_equal", "equal", "unequal", "inverse_truth", "both", "either",    "if_else_zero", "smaller",
-      "larger",   "power"};
-
   void check(const Instruction& i) const {
     const auto require_below = [](int k, Eigen::Index size) { require(k >= 0 && k < size, "operations: wrong index"); };
     const auto sizes = [](const Indices& of, int k) { return static_cast<Eigen::Index>(of[static_cast<size_t>(k)]); };
