@@ -77,7 +77,8 @@ void Lanes::start(const std::array<Attempt, width>& attempts, const Explicit& fi
   terms_ = first.system_.terms_of_rate();
   n_ = first.system_.core.n, size_ = first.system_.size;
   start_.resize(size_), y_.resize(size_), rates_.resize(size_ * (first.stages_ + 1)), factors_.resize(first.stages_);
-  trig_.resize(2 * n_), force_.resize(n_), correction_.resize(first.system_.core.constraints.closure.rows);
+  trig_.resize(2 * n_), force_.resize(n_);
+  correction_.resize(std::max(first.system_.core.constraints.closure.rows, 1));  // a tree's has an address too
   for (Vector* x : {&q_tree_, &v_, &applied_}) x->setZero(n_);
   has_force_ = false;
   std::fill(force_.begin(), force_.end(), Members{});

@@ -23,7 +23,7 @@ void StepLoop::use_implicit_method() {
 Explicit* StepLoop::prepare_explicit_step(double& bound) {
   bound = segment_end_;
   if (!method_ || method_ == radau_.get() || !(now.t < bound) || prepare_step(bound)) return nullptr;
-  return method_ == &dop853_ ? &dop853_ : method_ == &rk45_ ? &rk45_ : nullptr;
+  return method_ == &dop853_ ? &dop853_ : &rk45_;
 }
 
 // "auto" chooses the implicit method if damping or a controller makes the motion stiff.
