@@ -42,6 +42,7 @@ __all__ = [
     "reset_json",
     "skip_figures_without_matplotlib",
     "write_csv",
+    "write_file",
 ]
 
 LONG_S = 10.0  # a command that may take longer announces it
@@ -139,11 +140,15 @@ class _HasCsv(Protocol):
 
 
 def write_csv(result: _HasCsv, path: Path | None, as_json: bool) -> None:
-    """Write a result as a CSV file while signals are deferred, if a path was given."""
-    if path is None:
-        return
+    """Write a result as a CSV file, if a path was given."""
+    if path is not None:
+        write_file(result.to_csv, path, as_json)
+
+
+def write_file(write: Callable[[Path], object], path: Path, as_json: bool) -> None:
+    """Write a file while signals are deferred, and print its path."""
     with interrupts.deferred():
-        result.to_csv(path)
+        write(path)
     if not as_json:
         print_written([path])
 

@@ -7,6 +7,7 @@ import re
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from ckc_pin.cli.output import (
     require_file_path,
     skip_figures_without_matplotlib,
     write_csv,
+    write_file,
 )
 from ckc_pin.cli.signals import DONE, STOPPED, interrupt_code, interrupts
 from ckc_pin.errors import InputError
@@ -150,10 +152,7 @@ def _write_files(finished: ckc_pin.Run, csv: Path | None, mcap: Path | None, as_
     if mcap is not None:
         from ckc_pin.formats.mcap import write_mcap
 
-        with interrupts.deferred():
-            write_mcap(finished, mcap)
-        if not as_json:
-            print_written([mcap])
+        write_file(partial(write_mcap, finished), mcap, as_json)
     sys.stdout.flush()  # A live view may keep the command running.
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.base.atomic_files import open_atomic, temporary_folder
+from ckc_pin.base.atomic_files import temporary_folder, write_atomic
 from ckc_pin.errors import InputError
 from ckc_pin.formats.urdf.writer import to_urdf
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -46,7 +46,7 @@ def write_mcap(run: Run, path: str | Path) -> Path:
     except ImportError:
         raise InputError(f"{path}: writing MCAP files needs rosbags: pip install ckc_pin[bags]") from None
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with temporary_folder(path.parent) as folder:
+    with temporary_folder() as folder:
         bag = folder / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             connections: dict[str, Any] = {}
@@ -55,8 +55,7 @@ def write_mcap(run: Run, path: str | Path) -> Path:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], nanoseconds, bytes(store.serialize_cdr(message, kind)))
         (written,) = bag.glob("*.mcap")
-        with open_atomic(path) as file:
-            file.write(written.read_bytes())
+        write_atomic(path, written.read_bytes())
     return path
 
 
@@ -97,8 +96,7 @@ def _single_joints(mechanism: Mechanism) -> Array:
 
 def _wrenches(run: Run) -> dict[str, Array]:
     """Return the wrench of each joint along a run, (m, 6) arrays by name."""
-    ends = {name.removesuffix(".fx") for name in run.quantities if name.startswith("joint.") and name.endswith(".fx")}
-    joints = [name for name in dict.fromkeys(x.rpartition(".")[0] for x in run.quantities) if name in ends]
+    joints = [name.removesuffix(".fx") for name in run.quantities if name.startswith("joint.") and name.endswith(".fx")]
     return {joint.removeprefix("joint."): np.array([run[f"{joint}.{part}"] for part in WRENCH]).T for joint in joints}
 
 
