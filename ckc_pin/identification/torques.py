@@ -120,9 +120,10 @@ def _equations(
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
     limit = mechanism.motors.torque_limit
-    saturated = np.any((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=1) & used
+    at_limit = (tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1])
+    saturated = np.any(at_limit, axis=1) & used
     if saturated.sum() > MAX_SATURATED * used.sum():
-        k = int(np.argmax(np.sum((tau <= SATURATED * limit[0]) | (tau >= SATURATED * limit[1]), axis=0)))
+        k = int(np.argmax(np.sum(at_limit, axis=0)))
         raise InputError(
             f"identify: {record.source}: {torques[k]} is at its limit, {limit[0, k]:.4g} to {limit[1, k]:.4g}, most of "
             "the time, and may be wrong there; record a slower motion, or correct torque_limit"

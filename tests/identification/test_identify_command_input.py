@@ -1,4 +1,4 @@
-"""Measurements that cannot be used, through ckc identify: one message each, with its place and what would be right."""
+"""Measurements that cannot be used, through ckc identify: one message each, which names the place and a remedy."""
 
 from __future__ import annotations
 

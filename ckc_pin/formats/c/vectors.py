@@ -1,4 +1,4 @@
-"""Test vectors of exported C: random states, and what Pinocchio's terms and the reference formulations give there."""
+"""Test vectors of exported C: random states, with terms by Pinocchio and results of the reference formulations."""
 
 from __future__ import annotations
 

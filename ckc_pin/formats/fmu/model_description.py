@@ -144,7 +144,7 @@ def _add_variables(root: Element, variables: Sequence[Variable]) -> None:
 
 
 def _add_structure(root: Element, variables: Sequence[Variable], is_old: bool) -> None:
-    """Add the outputs, the derivatives and what is computed at the start, by index or by value reference."""
+    """Add the lists of outputs, of derivatives and of outputs without a start value, by index or by value reference."""
     structure, index = SubElement(root, "ModelStructure"), _indices(variables)
     outputs = [x for x in variables if x.causality == "output"]
     groups = {

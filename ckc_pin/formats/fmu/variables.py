@@ -1,4 +1,4 @@
-"""Variables of an FMU: names, units, and what an importer may do with them; in the order of `templates/fmu.c`."""
+"""Variables of an FMU: names, units, and whether an importer may set them; in the order of `templates/fmu.c`."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ typedef struct {
   double numbers[MECH_SIZE(MECH_NUMBERS)];
 } mech_model;
 
-/* A configuration and what the loops make of it, eqs. 1 to 5. */
+/* A configuration with the terms of its loops, eqs. 1 to 5. */
 typedef struct {
   double q_tree[MECH_NQ];                             /* q' */
   double trig[2 * MECH_NQ];                           /* cosines and sines of q' */
