@@ -89,7 +89,11 @@ CASES = {
         {f"joint.arm_{k}.damping": 0.02 for k in (1, 2, 3)},
         ("link.*.inertial", "joint.arm_*.damping"), ("link.plate.inertial", "joint.arm_*.damping"),
     ),
-    "stewart": Case(((0.1, 5.0), (0.06, 9.0), (0.02, 15.0)), 1e-5, 0.1),
+    "stewart": Case(
+        ((0.1, 5.0), (0.06, 9.0), (0.02, 15.0)), 1e-5, 0.1,
+        {f"joint.leg_{k}.damping": 5.0 for k in range(1, 7)},
+        ("link.*.inertial", "joint.leg_*.damping"), ("link.plate.inertial", "joint.leg_*.damping"),
+    ),
     "leg": Case(
         ((0.4, 4.0), (0.2, 9.0), (0.1, 14.0)), 1e-4, 0.002,
         {"joint.hip.damping": 0.003, "joint.knee.damping": 0.002},
