@@ -179,7 +179,7 @@ class Batch {
   void simulate_members(Team& team, const EnsembleTask& task, std::atomic<std::int64_t>& next,
                         const std::atomic<bool>& cancelled) const {
     const bool has_lanes = team.workers.size() > 1;
-    std::array<Lanes::Attempt, Lanes::width> attempts{};
+    std::array<Explicit::Attempt, Lanes::width> attempts;
     for (bool is_running = true; is_running && !cancelled;) {
       is_running = false;
       for (size_t lane = 0; lane < team.workers.size(); ++lane) {
@@ -190,10 +190,10 @@ class Batch {
             worker.member = k;
             if (has_lanes) team.lanes.set_constants(static_cast<int>(lane), worker.loop.core->compiled->constants());
           }
-        attempts[lane] = {nullptr, 0.0};
+        attempts[lane] = {};
         if (worker.member == not_started) continue;
         is_running = true;
-        if (has_lanes) attempts[lane].method = step_loop.prepare_explicit_step(attempts[lane].bound);
+        if (has_lanes) attempts[lane] = step_loop.prepare_explicit_step();
       }
       if (has_lanes) team.lanes.compute(attempts);
       for (auto& worker : team.workers) {

@@ -58,7 +58,7 @@ void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_sca
 }
 
 void SmallestSingularValue::compute_dense() {
-  if (gram_.rows() == 2 && rank_ == 2) {  // one planar loop
+  if (has_closed_form()) {
     smallest_ = 0.5 * (gram_(0, 0) + gram_(1, 1)) - std::hypot(0.5 * (gram_(0, 0) - gram_(1, 1)), gram_(0, 1));
     return;
   }
@@ -104,7 +104,14 @@ bool SmallestSingularValue::has_ended(int k) const {
 }
 
 void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
-  if (is_dense_) {  // inverse iteration, shifted by the eigenvalue
+  if (has_closed_form()) {  // the longer of the two rows of gram - smallest, turned by a right angle
+    const double a = gram_(0, 0) - smallest_, b = gram_(1, 1) - smallest_, c = gram_(0, 1);
+    if (a > b)
+      u_ << -c, a;
+    else
+      u_ << b, -c;
+    u_ = a + b > 0.0 ? u_.normalized() : Vector::Unit(2, 0);
+  } else if (is_dense_) {  // inverse iteration, shifted by the eigenvalue
     gram_.diagonal().array() -= smallest_ + 1e-12 * mean_square_;
     factor_.compute(gram_);
     fill_generic_vector(u_);

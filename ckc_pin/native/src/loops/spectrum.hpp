@@ -32,6 +32,7 @@ class SmallestSingularValue {
   static constexpr int max_steps_ = 16;  // Lanczos steps
   using Small = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, max_steps_, max_steps_>;
 
+  bool has_closed_form() const { return gram_.rows() == 2 && rank_ == 2; }  // one planar loop
   void compute_dense();
   void compute_sparse();
   double largest_eigenvalue_of_inverse();  // by Lanczos' method

@@ -75,15 +75,24 @@ Explicit::Explicit(Kind kind, System& system, Step& step, Work& work, const Tole
 // The stages that Lanes has computed, counted as if they had been evaluated here. False if there are not as many in the
 // budget.
 bool Explicit::take_computed_stages() {
-  computed_h_ = 0.0;
+  computed_.h = 0.0;
   if (work_.rhs + stages_ > work_.max_rhs) return false;
-  work_.rhs += stages_, system_.counts.factorizations += 2 * stages_;
+  for (int k = 0; k < stages_; ++k) count_computed_rhs();
   system_.set_last_rhs(step_.y_new);
   return true;
 }
 
+// Copy the rates that Lanes has computed to K_.
+void Explicit::read_computed_rates() {
+  const double* rate = computed_.rates;
+  for (int s = 0; s <= stages_; ++s)
+    for (Eigen::Index k = 0; k < K_.rows(); ++k, rate += computed_.stride) K_(k, s) = *rate;
+  rates_are_computed_ = false;
+}
+
 bool Explicit::stages(double h) {
-  if (h == computed_h_ && step_.t == computed_t_ && take_computed_stages()) return true;
+  rates_are_computed_ = h == computed_.h && step_.t == computed_.t && take_computed_stages();
+  if (rates_are_computed_) return true;
   const bool full_motion = this->checks_full_motion(h);
   K_.col(0) = step_.f;
   if (full_motion) X_.resize(step_.x.size(), stages_ + 1), x_stage_.resize(step_.x.size()), X_.col(0) = step_.x_dot;
@@ -108,21 +117,25 @@ double Explicit::error(double h) {
   const Eigen::Index motion_size = full_motion ? step_.x.size() : 0,
                      remaining_size = full_motion ? system_.size - system_.motion_size : step_.y.size();
   double square[2] = {0.0, 0.0};
+  if (rates_are_computed_) std::copy_n(computed_.squares, 2, square);
+  // In the order of Lanes, for the same digits.
   const auto add_weighted_error = [&](const Matrix& rates, const Vector& from, const Vector& to, Eigen::Index last) {
     scale_ = tolerance_.scale(from, to);
     for (int k = 0; k < (kind_ == dop853 ? 2 : 1); ++k) {
       error_.setZero(from.size());
       add_combination(rates, E_[k], stages_ + 1, 1.0, error_);
-      square[k] += (error_.tail(last).array() / scale_.tail(last).array()).matrix().squaredNorm();
+      for (Eigen::Index i = from.size() - last; i < from.size(); ++i) {
+        const double ratio = error_(i) / scale_(i);
+        square[k] += ratio * ratio;
+      }
     }
   };
   if (motion_size) add_weighted_error(X_, step_.x, step_.x_new, motion_size);
-  if (remaining_size) add_weighted_error(K_, step_.y, step_.y_new, remaining_size);
+  if (remaining_size && !rates_are_computed_) add_weighted_error(K_, step_.y, step_.y_new, remaining_size);
   const double size = static_cast<double>(motion_size + remaining_size),
                error_of_order_five = h * std::sqrt(square[0] / size);
   if (kind_ == rk45) return error_of_order_five;
-  // step size for RK45, whose error estimate is of order four
-  order_five_step_ = 0.5 * h * std::pow(std::max(error_of_order_five, 1e-10), -1.0 / 6.0);
+  order_five_size_ = 0.5 * h, order_five_error_ = error_of_order_five;
   if (square[0] == 0.0 && square[1] == 0.0) return 0.0;
   return h * square[0] / std::sqrt((square[0] + 0.01 * square[1]) * size);
 }
@@ -130,6 +143,10 @@ double Explicit::error(double h) {
 double Explicit::next_step_size(double t_bound) const {
   const double min_size = min_step_size(t_bound);
   return std::clamp(step_.h, min_size, std::max(min_size, tolerance_.max_step));
+}
+
+double Explicit::order_five_step_size() const {
+  return order_five_size_ * std::pow(std::max(order_five_error_, 1e-10), kind_ == dop853 ? -1.0 / 6.0 : -1.0 / 5.0);
 }
 
 bool Explicit::make_step(double t_bound) {
@@ -163,8 +180,7 @@ bool Explicit::make_step(double t_bound) {
       growth_next_ = step_.t_new < t_bound && factor > max_single_growth;
       step_.h_next = step_size * (growth_next_ && !growth_pending_ ? max_single_growth : factor);
       if (step_.t_new == t_bound && !rejected) step_.h_next = std::max(step_.h_next, step_.h);
-      if (kind_ == rk45)
-        order_five_step_ = step_size * length_safety * safety * std::pow(std::max(size, 1e-10), exponent);
+      if (kind_ == rk45) order_five_size_ = step_size * length_safety * safety, order_five_error_ = size;
       return true;
     }
     if (!agrees && !return_to_start()) return false;
@@ -196,6 +212,7 @@ bool Explicit::extra_stages(double h) {
 
 bool Explicit::interpolate(double at, Out y_at) {
   const double h = step_.t_new - step_.t, x = (at - step_.t) / h;
+  if (rates_are_computed_) read_computed_rates();
   if (!has_dense_output_ && kind_ == rk45) {
     F_.noalias() = h * K_ * D_;
   } else if (!has_dense_output_) {

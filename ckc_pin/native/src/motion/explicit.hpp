@@ -8,24 +8,38 @@ namespace ckc {
 class Explicit : public Method {
  public:
   enum Kind { dop853, rk45 };
+  // The next step: its method, the time that it must not exceed, and whether the rate at its start is known.
+  struct Attempt {
+    Explicit* method = nullptr;
+    double bound = 0.0;
+    bool rate_is_known = false;
+  };
   Explicit(Kind kind, System& system, Step& step, Work& work, const Tolerance& tolerance);
 
   bool make_step(double t_bound) override;
   bool interpolate(double t, Out y) override;
   void reject_step(double step_size) override;
   void accept_step() override;
-  void reset_history() override { growth_pending_ = false, computed_h_ = 0.0; }
+  void reset_history() override { growth_pending_ = start_is_computed_ = false, computed_.h = 0.0; }
   const char* name() const override { return kind_ == dop853 ? "DOP853" : "RK45"; }
   int error_order() const override { return kind_ == dop853 ? 7 : 4; }
   // Size of the next step that `make_step` will try first.
   double next_step_size(double t_bound) const;
   // Step size of RK45, estimated from the error of the last step.
-  double order_five_step_size() const { return order_five_step_; }
+  double order_five_step_size() const;
 
  private:
   friend class Lanes;
+  // A step whose stages were computed with those of others (Lanes), if h > 0.
+  struct Computed {
+    double t = 0.0, h = 0.0;
+    double squares[2];    // of its error estimates, relative to the tolerance
+    const double* rates;  // at the stages, one number each `stride`; overwritten when Lanes computes the next steps
+    Eigen::Index stride;
+  };
   bool stages(double h);
   bool take_computed_stages();
+  void read_computed_rates();
   double error(double h);
   bool extra_stages(double h);
 
@@ -37,11 +51,12 @@ class Explicit : public Method {
   Matrix F_;  // coefficients of the dense output, (size, powers)
   Matrix X_;  // rates of the full motion at the stages, (full motion size, stages)
   Vector y_stage_, x_stage_, scale_, error_;
-  double computed_t_ = 0.0, computed_h_ = 0.0;  // step whose stages were computed with those of others (Lanes), if h > 0
+  Computed computed_;
+  bool rates_are_computed_ = false;  // whether the rates at the stages are those of computed_, and not in K_
   bool has_dense_output_ = false;
   // Whether the last accepted step, and the new one, ask for a growth of more than max_single_growth.
   bool growth_pending_ = false, growth_next_ = false;
-  double order_five_step_ = 0.0;
+  double order_five_size_ = 0.0, order_five_error_ = 1.0;  // of the last step: its size, reduced for safety, and error
 };
 
 }  // namespace ckc

@@ -18,12 +18,41 @@ using Members = CompiledTerms::Members;
 // sum = start + factors[0] * rates[0] + ... of vectors of `size` numbers
 WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* const* rates, const Members* factors,
                                         int count, int size, Members* sum) {
-  for (int k = 0; k < size; ++k) {
+  constexpr int block_size = 4;  // numbers whose sums stay in registers, and do not wait for one another
+  int k = 0;
+  for (; k + block_size <= size; k += block_size) {
+    Members x[block_size];
+    std::copy_n(&start[k], block_size, x);
+    for (int i = 0; i < count; ++i)
+      for (int j = 0; j < block_size; ++j)
+        for (int lane = 0; lane < width; ++lane) x[j].of[lane] += factors[i].of[lane] * rates[i][k + j].of[lane];
+    std::copy_n(x, block_size, &sum[k]);
+  }
+  for (; k < size; ++k) {
     Members x = start[k];
     for (int i = 0; i < count; ++i)
       for (int lane = 0; lane < width; ++lane) x.of[lane] += factors[i].of[lane] * rates[i][k].of[lane];
     sum[k] = x;
   }
+}
+
+// sum of (error / (rtol * max(|from|, |to|) + atol))^2
+WITH_WIDEST_REGISTERS void add_squares(const Members* error, const Members* from, const Members* to,
+                                       const Members& rtol, const Members& atol, int size, Members& sum) {
+  sum = {};
+  for (int k = 0; k < size; ++k)
+    for (int lane = 0; lane < width; ++lane) {
+      const double a = std::abs(from[k].of[lane]), b = std::abs(to[k].of[lane]);
+      const double ratio = error[k].of[lane] / (rtol.of[lane] * (a < b ? b : a) + atol.of[lane]);
+      sum.of[lane] += ratio * ratio;
+    }
+}
+
+// Members all of whose numbers are finite get 0, the others NaN.
+WITH_WIDEST_REGISTERS void find_not_finite(const Members* x, int size, Members& result) {
+  result = {};
+  for (int k = 0; k < size; ++k)
+    for (int lane = 0; lane < width; ++lane) result.of[lane] += 0.0 * x[k].of[lane];
 }
 
 }  // namespace
@@ -36,11 +65,11 @@ void Lanes::set_constants(int lane, const Vector& constants) {
   for (size_t k = 0; k < constants_.size(); ++k) constants_[k].of[lane] = constants(k);
 }
 
-void Lanes::compute(const std::array<Attempt, width>& attempts) {
+void Lanes::compute(const Attempts& attempts) {
   for (Explicit::Kind kind : {Explicit::dop853, Explicit::rk45}) compute(attempts, kind);
 }
 
-void Lanes::compute(const std::array<Attempt, width>& attempts, Explicit::Kind kind) {
+void Lanes::compute(const Attempts& attempts, Explicit::Kind kind) {
   int first = -1, count = 0;
   for (int lane = 0; lane < width; ++lane) {
     Explicit* method = attempts[lane].method;
@@ -53,30 +82,37 @@ void Lanes::compute(const std::array<Attempt, width>& attempts, Explicit::Kind k
   start(attempts, method);
   for (int lane = 0; lane < width; ++lane)  // lanes without a member repeat one that has
     if (!methods_[lane]) {
-      for (Members& x : start_) x.of[lane] = x.of[first];
-      for (int k = 0; k < size_; ++k) rates_[k].of[lane] = rates_[k].of[first];
-      h_.of[lane] = h_.of[first], t_[lane] = t_[first];
+      for (Lines* x : {&start_, &rates_})
+        for (int k = 0; k < size_; ++k) (*x)[k].of[lane] = (*x)[k].of[first];
+      for (Members* x : {&h_, &rtol_, &atol_}) x->of[lane] = x->of[first];
+      t_[lane] = t_[first];
     }
-  for (int s = 1; s < stages; ++s) combine(method.A_.row(s), s), evaluate(method.C_(s), s);
-  combine(method.B_, stages);
+  compute_unknown_starts(attempts);
+  for (int s = 1; s < stages; ++s) combine(start_, method.A_.row(s), s, h_, y_), evaluate(method.C_(s), s);
+  combine(start_, method.B_, stages, h_, y_);
   evaluate(1.0, stages);
+  Members not_finite, one, squares[2];
+  find_not_finite(y_.data(), size_, not_finite);
+  std::fill_n(one.of, width, 1.0);
+  for (int k = 0; k < (kind == Explicit::dop853 ? 2 : 1); ++k) {
+    combine(zero_, method.E_[k], stages + 1, one, error_);
+    add_squares(error_.data(), start_.data(), y_.data(), rtol_, atol_, size_, squares[k]);
+  }
   for (int lane = 0; lane < width; ++lane) {
-    if (!methods_[lane]) continue;
+    if (!methods_[lane] || not_finite.of[lane] != 0.0) continue;
     Explicit& of_lane = *methods_[lane];
     Step& step = of_lane.step_;
-    for (int s = 0; s <= stages; ++s)
-      for (int k = 0; k < size_; ++k) of_lane.K_(k, s) = rates_[s * size_ + k].of[lane];
-    for (int k = 0; k < size_; ++k) step.y_new(k) = y_[k].of[lane];
-    step.f_new = of_lane.K_.col(stages);
-    if (!step.y_new.allFinite() || !of_lane.K_.leftCols(stages + 1).allFinite()) continue;
-    of_lane.computed_t_ = t_[lane], of_lane.computed_h_ = h_.of[lane];
+    const Members* f_new = &rates_[stages * size_];
+    for (int k = 0; k < size_; ++k) step.y_new(k) = y_[k].of[lane], step.f_new(k) = f_new[k].of[lane];
+    of_lane.computed_ = {t_[lane], h_.of[lane], {squares[0].of[lane], squares[1].of[lane]}, &rates_[0].of[lane], width};
   }
 }
 
-void Lanes::start(const std::array<Attempt, width>& attempts, const Explicit& first) {
+void Lanes::start(const Attempts& attempts, const Explicit& first) {
   terms_ = first.system_.terms_of_rate();
   n_ = first.system_.core.n, size_ = first.system_.size;
-  start_.resize(size_), y_.resize(size_), rates_.resize(size_ * (first.stages_ + 1)), factors_.resize(first.stages_);
+  for (Lines* x : {&start_, &y_, &error_, &zero_}) x->resize(size_);
+  rates_.resize(size_ * (first.stages_ + 1)), factors_.resize(first.stages_ + 1);
   trig_.resize(2 * n_), force_.resize(n_);
   correction_.resize(std::max(first.system_.core.constraints.closure.rows, 1));  // a tree's has an address too
   for (Vector* x : {&q_tree_, &v_, &applied_}) x->setZero(n_);
@@ -89,32 +125,55 @@ void Lanes::start(const std::array<Attempt, width>& attempts, const Explicit& fi
     const Step& step = method.step_;
     t_[lane] = step.t;
     h_.of[lane] = std::min(step.t + method.next_step_size(attempts[lane].bound), attempts[lane].bound) - step.t;
+    rtol_.of[lane] = method.tolerance_.rtol, atol_.of[lane] = method.tolerance_.atol;
     for (int k = 0; k < size_; ++k) start_[k].of[lane] = step.y(k), rates_[k].of[lane] = step.f(k);
   }
 }
 
+// Compute the rates at the starts of steps where they are not known.
+void Lanes::compute_unknown_starts(const Attempts& attempts) {
+  const auto is_unknown = [&](int lane) { return methods_[lane] && !attempts[lane].rate_is_known; };
+  int unknown = 0;
+  for (int lane = 0; lane < width; ++lane) unknown += is_unknown(lane);
+  if (!unknown) return;
+  std::copy(start_.begin(), start_.end(), y_.begin());
+  evaluate(0.0, 0);
+  for (int lane = 0; lane < width; ++lane) {
+    if (!methods_[lane]) continue;
+    Step& step = methods_[lane]->step_;
+    if (is_unknown(lane)) {
+      for (int k = 0; k < size_; ++k) step.f(k) = rates_[k].of[lane];
+      methods_[lane]->start_is_computed_ = true;
+    } else {
+      for (int k = 0; k < size_; ++k) rates_[k].of[lane] = step.f(k);
+    }
+  }
+}
+
 template <class Coefficients>
-void Lanes::combine(const Coefficients& coefficients, int count) {
+void Lanes::combine(const Lines& start, const Coefficients& coefficients, int count, const Members& factor,
+                    Lines& sum) {
   constexpr int max_stages = 16;
   const Members* rates[max_stages];
   int used = 0;
   for (int i = 0; i < count; ++i) {
     if (coefficients(i) == 0.0) continue;
-    for (int lane = 0; lane < width; ++lane) factors_[used].of[lane] = h_.of[lane] * coefficients(i);
+    for (int lane = 0; lane < width; ++lane) factors_[used].of[lane] = factor.of[lane] * coefficients(i);
     rates[used++] = &rates_[i * size_];
   }
-  add_products(start_.data(), rates, factors_.data(), used, size_, y_.data());
+  add_products(start.data(), rates, factors_.data(), used, size_, sum.data());
 }
 
 void Lanes::evaluate(double stage_time, int stage) {
-  Members *rate = &rates_[stage * size_], sound;
+  Members *rate = &rates_[stage * size_], sound, not_finite;
   compute_cosines_and_sines(y_[0].of, n_ * width, trig_[0].of, trig_[n_].of);
   if (has_force_) apply_forces(stage_time);
   std::copy_n(&y_[n_], n_, rate);
   terms_->accelerations(y_.data(), trig_.data(), &y_[n_], force_.data(), correction_.data(), constants_.data(),
                         rate + n_, &sound);
+  find_not_finite(rate, size_, not_finite);
   for (int lane = 0; lane < width; ++lane)
-    if (!(sound.of[lane] > 0.0)) methods_[lane] = nullptr;
+    if (!(sound.of[lane] > 0.0) || not_finite.of[lane] != 0.0) methods_[lane] = nullptr;
 }
 
 void Lanes::apply_forces(double stage_time) {

@@ -15,34 +15,32 @@ namespace ckc {
 class Lanes {
  public:
   static constexpr int width = CompiledTerms::members;
-  // The next step of a member: its method, and the time that the step must not exceed.
-  struct Attempt {
-    Explicit* method;
-    double bound;
-  };
   // Set the mechanism's numbers of the member in a lane.
   void set_constants(int lane, const Vector& constants);
-  // Compute the stages of the first attempts of these members, by lane; `method` is null where there is no member, or
-  // where its next step cannot be computed here. The methods take them when they make that step.
-  void compute(const std::array<Attempt, width>& attempts);
+  using Attempts = std::array<Explicit::Attempt, width>;
+  // Compute the stages and error estimates of the first attempts of these members, by lane; without a method where there
+  // is no member, or where its next step cannot be computed here. The methods take them when they make that step.
+  void compute(const Attempts& attempts);
 
  private:
   using Members = CompiledTerms::Members;
   using Lines = std::vector<Members>;
-  void compute(const std::array<Attempt, width>& attempts, Explicit::Kind kind);
-  void start(const std::array<Attempt, width>& attempts, const Explicit& first);
+  void compute(const Attempts& attempts, Explicit::Kind kind);
+  void start(const Attempts& attempts, const Explicit& first);
+  void compute_unknown_starts(const Attempts& attempts);
   void evaluate(double stage_time, int stage);  // the rate at y_, and which lanes stay valid
   void apply_forces(double stage_time);
+  // sum = start + the combination of the first rates, times `factor`
   template <class Coefficients>
-  void combine(const Coefficients& coefficients, int count);  // y_ = y at the start + the combination of rates
+  void combine(const Lines& start, const Coefficients& coefficients, int count, const Members& factor, Lines& sum);
 
   Explicit* methods_[width];  // null: the lane's stages are not valid
   const CompiledTerms* terms_ = nullptr;
   int n_ = 0, size_ = 0;
   bool has_force_ = false;
   double t_[width];
-  Members h_;
-  Lines start_, y_, rates_, factors_, trig_, force_, correction_, constants_;
+  Members h_, rtol_, atol_;
+  Lines start_, zero_, y_, rates_, error_, factors_, trig_, force_, correction_, constants_;
   Vector q_tree_, v_, applied_;
 };
 

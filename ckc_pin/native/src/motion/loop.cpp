@@ -98,8 +98,11 @@ bool StepLoop::move_desired(double end, In x) {
 }
 
 Stop StepLoop::advance(double until, bool final, double pause, double budget) {
-  const auto started = Clock::now();
-  const auto elapsed = [&] { return std::chrono::duration<double>(Clock::now() - started).count(); };
+  const bool is_timed = pause >= 0.0 || std::isfinite(budget);
+  const auto started = is_timed ? Clock::now() : Clock::time_point();
+  const auto elapsed = [&] {
+    return is_timed ? std::chrono::duration<double>(Clock::now() - started).count() : 0.0;
+  };
   system->may_change_partition = !control->needs_fixed_partition();
   const bool continues = std::exchange(is_paused_, false) && until == target_;
   const double from = t();

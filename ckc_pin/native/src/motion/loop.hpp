@@ -71,9 +71,9 @@ class StepLoop {
   // If the motion does not end and neither control nor state have changed for several calls, the last step may end
   // beyond `until`. The present state is then inside that step, which is discarded at the next change.
   Stop advance(double until, bool final, double pause, double budget);
-  // The explicit method that makes the next step, with the time that the step must not exceed, after the evaluations that
-  // precede it. Null at the start and if another method makes it.
-  Explicit* prepare_explicit_step(double& bound);
+  // The next step, after the evaluations that precede it, except that of the rate. No method at the start and if another
+  // method makes it.
+  Explicit::Attempt prepare_explicit_step();
   // Present time and state.
   double t() const { return waiting_step_ ? t_present_ : now.t; }
   const Vector& y() const { return waiting_step_ ? y_present_ : now.y; }

@@ -20,10 +20,11 @@ void StepLoop::use_implicit_method() {
   use_method(*radau_);
 }
 
-Explicit* StepLoop::prepare_explicit_step(double& bound) {
-  bound = segment_end_;
-  if (!method_ || method_ == radau_.get() || !(now.t < bound) || prepare_step(bound)) return nullptr;
-  return method_ == &dop853_ ? &dop853_ : &rk45_;
+Explicit::Attempt StepLoop::prepare_explicit_step() {
+  if (!method_ || method_ == radau_.get() || !(now.t < segment_end_)) return {};
+  const bool is_prepared = joint_modes_known_ && state_is_accepted_;
+  if (!is_prepared && prepare_step(segment_end_)) return {};
+  return {method_ == &dop853_ ? &dop853_ : &rk45_, segment_end_, rate_is_known_};
 }
 
 // "auto" chooses the implicit method if damping or a controller makes the motion stiff.

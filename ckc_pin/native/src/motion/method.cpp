@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 
 namespace ckc {
 
@@ -11,7 +12,8 @@ double Method::min_step_size(double t_bound) const {
 }
 
 bool Method::evaluate_start() {
-  if (!evaluate(step_.t, step_.y, step_.f)) return false;
+  if (std::exchange(start_is_computed_, false) ? !count_computed_rhs() : !evaluate(step_.t, step_.y, step_.f))
+    return false;
   const int size = system_.full_motion_size();
   for (Vector* x : {&step_.x, &step_.x_dot, &step_.x_new, &step_.x_dot_new}) x->resize(size);
   if (size) system_.full_motion(step_.f, step_.x, step_.x_dot);

@@ -68,12 +68,14 @@ class Method : public Interpolant {
   double initial_step_size(double t_bound, int order);
   virtual int error_order() const = 0;
 
-  // Evaluate the rate and the full motion at the start of the next step.
+  // Evaluate the rate and the full motion at the start of the next step. If Lanes has computed the rate, take that.
   bool evaluate_start();
 
   bool evaluate(double t, In y, Out y_dot) { return work_.count_rhs() && system_.rhs(t, y, y_dot); }
 
  protected:
+  // Whether a right-hand side that Lanes has computed is in the budget. It is counted as if it had been evaluated here.
+  bool count_computed_rhs() { return work_.count_rhs() && (system_.counts.factorizations += 2, true); }
   // Whether to give up, because shorter steps would not help.
   bool must_stop() const { return work_.budget_exhausted || system_.control.failure.raised; }
   // Smallest step size that changes t.
@@ -96,6 +98,7 @@ class Method : public Interpolant {
   Step& step_;
   Work& work_;
   const Tolerance& tolerance_;
+  bool start_is_computed_ = false;  // whether Lanes has computed step_.f
   Vector x_scale_, x_error_;
 };
 
