@@ -23,13 +23,13 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
     lu_.setZero(rows, columns);
-    row_end_.assign(rows, 0), row_at_.resize(rows), eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
+    row_begin_.assign(rows, 0), row_end_.assign(rows, 0), row_at_.resize(rows), eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
     for (auto& eliminated : eliminated_rows_) eliminated.reserve(rows);
     active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
       int first_column = rows;
       for (int j : pattern[i]) first_column = std::min(first_column, position_of_[j]);
-      if (first_column < rows) rows_starting_at_[first_column].push_back(i);
+      if (first_column < rows) rows_starting_at_[first_column].push_back(i), row_begin_[i] = first_column;
     }
   } else {
     qr_.setZero(rows, columns);
@@ -50,8 +50,9 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
     return eliminate_small();
   }
   for (int i = 0; i < rows_; ++i) {
-    lu_.row(i).head(row_end_[i]).setZero();  // clear the fill-in of the previous factorization
-    row_end_[i] = 0;
+    // Clear the fill-in of the previous factorization.
+    lu_.row(i).segment(row_begin_[i], row_end_[i] - row_begin_[i]).setZero();
+    row_end_[i] = row_begin_[i];
     for (int j : pattern_[i]) {
       const int k = position_of_[j];
       lu_(i, k) = a(i, at(j));

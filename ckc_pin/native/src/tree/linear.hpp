@@ -35,7 +35,7 @@ class Factor {
   Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
   Matrix qr_;
   Vector tau_, work_;
-  Indices row_end_;                        // by row: end of its interval
+  Indices row_begin_, row_end_;            // by row: its interval
   Indices row_at_;                         // rows in pivot order
   std::vector<Indices> rows_starting_at_;  // by column: rows whose interval begins there
   std::vector<Indices> eliminated_rows_;   // by column: rows that its elimination changed
