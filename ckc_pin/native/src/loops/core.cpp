@@ -14,8 +14,8 @@ namespace ckc {
 constexpr int max_sparse_size = 12;
 constexpr double min_dense_share = 0.2;
 // Duration of a multiplication in sparse elimination, in units of one in projection, which works on dense columns. It
-// takes 4 units when repeated; in a run, where other code follows, the processor predicts its short loops badly.
-constexpr double sparse_cost = 12.0;
+// takes 3 to 4 units when repeated; in a run, where other code follows, the processor predicts its short loops badly.
+constexpr double sparse_cost = 6.0;
 
 Core::Core(CoreTable table)
     : tree(table.model, std::move(table.q_index)),

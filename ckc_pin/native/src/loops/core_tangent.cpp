@@ -354,9 +354,10 @@ bool Core::unit_force_responses(const Indices& at, Matrix& columns) {
   const bool is_sparse = factorize_sparsely();
   if (!is_sparse && !find_tangent_basis(residual_, rank_lost_pivot)) return false;
   if (!is_sparse) factorize_tangent_inertia();
-  for (size_t k = 0; k < at.size(); ++k) {
+  if (is_sparse) sparse_->solve_unit_forces(at, columns);
+  for (size_t k = 0; k < at.size() && !is_sparse; ++k) {
     y_.setUnit(at[k]);
-    is_sparse ? sparse_->solve(y_, residual_, columns.col(k)) : add_force_response(y_, columns.col(k));
+    add_force_response(y_, columns.col(k));
   }
   for (size_t k = 0; k < at.size() && has_released_rows(); ++k) {
     y_.setUnit(at[k]);

@@ -106,8 +106,8 @@ bool SparseElimination::compute(const Matrix& D, const Matrix& J) {
       if (is_row_[p] != is_row_[place]) sums_(place) += std::abs(factor * values[e]);
       for (int r = first_run_[e]; r < first_run_[e + 1]; ++r) {
         const Run& run = runs_[r];
-        double* const target = values + run.target;
-        const double* const source = values + run.source;
+        double* __restrict const target = values + run.target;  // of another column than the source
+        const double* __restrict const source = values + run.source;
         for (int i = 0; i < run.length; ++i) target[i] -= factor * source[i];
       }
     }
@@ -116,30 +116,49 @@ bool SparseElimination::compute(const Matrix& D, const Matrix& J) {
   return true;
 }
 
-void SparseElimination::substitute(Vector& x) const {
+template <class Unknowns>
+void SparseElimination::substitute(Unknowns& x) const {
   const int size = static_cast<int>(place_.size());
   for (int p = 0; p < size; ++p)
-    for (int e = column_start_[p] + 1; e < column_start_[p + 1]; ++e) x(place_of_value_[e]) -= values_(e) * x(p);
+    for (int e = column_start_[p] + 1; e < column_start_[p + 1]; ++e) x.row(place_of_value_[e]) -= values_(e) * x.row(p);
   for (int p = size - 1; p >= 0; --p) {
-    double value = x(p) * inverses_(p);
-    for (int e = column_start_[p] + 1; e < column_start_[p + 1]; ++e) value -= values_(e) * x(place_of_value_[e]);
-    x(p) = value;
+    x.row(p) *= inverses_(p);
+    for (int e = column_start_[p] + 1; e < column_start_[p + 1]; ++e) x.row(p) -= values_(e) * x.row(place_of_value_[e]);
   }
+}
+
+// Solution, and its refinement into `residual`, which contains the right-hand sides before.
+template <class Unknowns>
+void SparseElimination::solve_refined(Unknowns& solution, Unknowns& residual) const {
+  solution = residual;
+  substitute(solution);
+  for (const std::vector<Entry>* entries : {&inertia_entries_, &jacobian_entries_})
+    for (const Entry& entry : *entries) {
+      residual.row(entry.place_of_row) -= entry.value * solution.row(entry.place_of_column);
+      if (entry.place_of_row != entry.place_of_column)
+        residual.row(entry.place_of_column) -= entry.value * solution.row(entry.place_of_row);
+    }
+  substitute(residual);
 }
 
 void SparseElimination::solve(In force, In residual, Out a) {
   for (int k = 0; k < n_; ++k) residual_(place_[k]) = force(k);
   for (size_t i = 0; i < kept_.size(); ++i) residual_(place_[static_cast<size_t>(n_) + i]) = -residual(kept_[i]);
-  solution_ = residual_;
-  substitute(solution_);
-  for (const std::vector<Entry>* entries : {&inertia_entries_, &jacobian_entries_})
-    for (const Entry& entry : *entries) {
-      residual_(entry.place_of_row) -= entry.value * solution_(entry.place_of_column);
-      if (entry.place_of_row != entry.place_of_column)
-        residual_(entry.place_of_column) -= entry.value * solution_(entry.place_of_row);
-    }
-  substitute(residual_);
+  solve_refined(solution_, residual_);
   for (int k = 0; k < n_; ++k) a(k) = solution_(place_[k]) + residual_(place_[k]);
+}
+
+void SparseElimination::solve_unit_forces(const Indices& at, Matrix& columns) {
+  solutions_.resize(solution_.size(), block_size), residuals_.resize(solution_.size(), block_size);
+  const int count = static_cast<int>(at.size());
+  for (int first = 0; first < count; first += block_size) {
+    const int last = std::min(first + block_size, count);
+    residuals_.setZero();
+    for (int j = first; j < last; ++j) residuals_(place_[at[j]], j - first) = 1.0;
+    solve_refined(solutions_, residuals_);
+    for (int j = first; j < last; ++j)
+      for (int k = 0; k < n_; ++k) columns(k, j) = solutions_(place_[k], j - first) + residuals_(place_[k], j - first);
+  }
 }
 
 }  // namespace ckc

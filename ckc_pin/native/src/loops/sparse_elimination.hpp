@@ -22,8 +22,11 @@ class SparseElimination {
   // Solve D' a = force + J^T lambda, J a = -residual, with one step of iterative refinement: J D'^-1 J^T has the square of
   // J's condition number.
   void solve(In force, In residual, Out a);
+  // Solve the same for unit forces on these coordinates, one column each, with J a = 0.
+  void solve_unit_forces(const Indices& at, Matrix& columns);
 
  private:
+  static constexpr int block_size = 8;  // right-hand sides of which each entry of L is applied to all at a time
   // Entries below one another in one column of L, from which a multiple of entries of an earlier column is subtracted.
   struct Run {
     int target, source, length;
@@ -33,7 +36,10 @@ class SparseElimination {
     int place_of_row, place_of_column;
     double value;
   };
-  void substitute(Vector& x) const;
+  template <class Unknowns>
+  void solve_refined(Unknowns& solution, Unknowns& residual) const;
+  template <class Unknowns>
+  void substitute(Unknowns& x) const;
   Indices choose_order(std::vector<std::vector<char>>& coupled) const;
 
   int n_;
@@ -47,6 +53,7 @@ class SparseElimination {
   std::vector<Run> runs_;
   long operations_ = 0;
   Vector values_, sums_, inverses_, solution_, residual_;
+  Eigen::Matrix<double, Eigen::Dynamic, block_size, Eigen::RowMajor> solutions_, residuals_;
 };
 
 }  // namespace ckc
