@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 import ckc_pin
 from ckc_pin.analysis.map import singularity_map, workspace_sections
+from ckc_pin.view.identification_figures import draw_identification
 from ckc_pin.view.map_figures import draw_map, draw_sections
 from ckc_pin.view.player import play_runs
+from ckc_pin.view.report_page import render_report
 from ckc_pin.view.style import figure_style
+from scripts.experiments import identification_trials as trials
 from scripts.experiments.chart import shrink
 from scripts.experiments.joint_pictures import draw_friction, draw_preload
 
@@ -36,6 +41,32 @@ def screenshot(page: Page, runs: list[ckc_pin.Run], t: float, path: Path) -> Non
         page.screenshot(path=path)
 
 
+def reports() -> Iterator[tuple[str, ckc_pin.Identification]]:
+    """Yield names and results of identifications from simulated records, with one that is not fitted."""
+    names = trials.CASES["five_bar"].parameters
+    start = ckc_pin.load("five_bar")
+    torques = [trials.measure_torques("five_bar", seed) for seed in (0, 1)]
+    yield "five_bar", ckc_pin.identify(start, torques[0], names, validation=torques[1])
+    runs = [trials.measure_motion("delta", seed) for seed in (0, 1)]
+    of_motion = trials.CASES["delta"].of_motion
+    yield "delta", ckc_pin.identify("delta", runs[0], of_motion, method="motion", validation=runs[1])
+    plate = {"link.plate.mass": 0.8 * ckc_pin.load("stewart").tree.model.inertias[-1].mass}
+    platform = [trials.measure_torques("stewart", seed) for seed in (0, 1)]
+    names = ("link.plate.inertial", "joint.leg_*.damping")
+    yield "stewart", ckc_pin.identify(ckc_pin.load("stewart", plate), platform[0], names, validation=platform[1])
+
+
+def picture_reports(page: Page) -> None:
+    """Save pictures of whole reports of identifications."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, result in reports():
+            with figure_style():
+                text = render_report(result, draw_identification(result))
+            (Path(folder) / "report.html").write_text(text, encoding="utf-8")
+            page.goto((Path(folder) / "report.html").as_uri())
+            page.screenshot(path=IMAGES / "guide" / f"report_{name}.png", full_page=True)
+
+
 def main(chromium: Path) -> None:
     """Make the pictures of playback, then the figures."""
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -46,6 +77,7 @@ def main(chromium: Path) -> None:
         page = browser.new_page(viewport=SIZE)
         screenshot(page, [tracking], 1.45, IMAGES / "five_bar_tracking.png")
         screenshot(page, [lift], 1.0, IMAGES / "two_ur5_lift.png")
+        picture_reports(page)
         browser.close()
     with figure_style():
         for name in ("five_bar", "five_bar_as_printed"):
@@ -53,5 +85,5 @@ def main(chromium: Path) -> None:
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
         draw_friction(IMAGES / "five_bar_friction.png", DPI)
         draw_preload(IMAGES / "two_ur5_preload.png", DPI)
-    for picture in IMAGES.glob("*.png"):
+    for picture in [*IMAGES.glob("*.png"), *IMAGES.glob("guide/report_*.png")]:
         shrink(picture)
