@@ -130,7 +130,7 @@ void Lanes::start(const Attempts& attempts, const Explicit& first) {
   }
 }
 
-// Compute the rates at the starts of steps where they are not known.
+// Compute the missing rates at the starts of steps.
 void Lanes::compute_unknown_starts(const Attempts& attempts) {
   const auto is_unknown = [&](int lane) { return methods_[lane] && !attempts[lane].rate_is_known; };
   int unknown = 0;
