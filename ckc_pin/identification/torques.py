@@ -10,7 +10,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
-from ckc_pin.identification.fit import LinearFit, fit_linear, no_prior
+from ckc_pin.identification.fit import fit_linear, no_prior
 from ckc_pin.identification.measured_motion import (
     MeasuredMotion,
     SplineFit,
@@ -81,18 +81,22 @@ def identify_torques(
             )
         fit = fit_linear(columns, right, prior_equations, robust=robust)
         parts = np.split(fit.influence, np.cumsum([len(x.right) for x in fitted])[:-1])
-        errors_of_motion = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in fitted]
-        fit = fit.with_errors(
-            [e for x, part in zip(errors_of_motion, parts, strict=True) for e in x.steps(part)],
-            lambda lag: np.average(
-                [x.covariance(lag) for x in errors_of_motion], axis=0, weights=[len(x.t) for x in errors_of_motion]
-            ),
-        )
+        errors_of_motion = [_MotionErrors.of(mechanism, regressor, x, fit.x) for x in equations]
+        of_fitted = [x for x in errors_of_motion if not x.validation]
+
+        def covariance(lag: int) -> Array:
+            return np.average([x.covariance(lag) for x in of_fitted], axis=0, weights=[len(x.t) for x in of_fitted])
+
+        fit = fit.with_errors([e for x, part in zip(of_fitted, parts, strict=True) for e in x.steps(part)], covariance)
+        noise_of_torques = _positive_part(fit.noise - covariance(0))
         step = fit.x
         if physical:
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
         advice = MotionAdvice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
-    motions = [_prediction(x, mechanism.motors.names, step, fit) for x in equations]
+    motions = [
+        _prediction(x, mechanism.motors.names, step, noise_of_torques, errors.covariance(0))
+        for x, errors in zip(equations, errors_of_motion, strict=True)
+    ]
     return make_result(
         "torques", regressor, fit, regressor.start + regressor.scale * step, motions, leak=LEAK_TOLERANCE,
         complete=physical, instants=len(right), warnings=warnings, prior=prior_equations, advice=advice,
@@ -190,6 +194,7 @@ class _MotionErrors:
     t: Array
     gains: Array
     fits: Sequence[SplineFit]
+    validation: bool
 
     @classmethod
     def of(cls, mechanism: Mechanism, regressor: TorqueRegressor, equations: _Equations, x: Array) -> _MotionErrors:
@@ -211,7 +216,7 @@ class _MotionErrors:
                 shifted = residual(shift_motion(mechanism, motion, equations.fits, order, name, shift))
                 for i, column in enumerate((shifted - before).T / shift):
                     gains[order, :, i, k] = np.interp(full.t, motion.t, column)
-        return cls(full.t, gains, list(equations.fits.values()))
+        return cls(full.t, gains, list(equations.fits.values()), equations.record.validation)
 
     def steps(self, influence: Array) -> list[Array]:
         """Return the steps (r, any) of a solution with such influence (m, r, d), of unit variance each."""
@@ -236,19 +241,30 @@ class _MotionErrors:
         return fit.errors(self.t[at], apart).reshape(len(at), gains.shape[2], -1)
 
 
-def _prediction(equations: _Equations, motors: Sequence[str], step: Array, fit: LinearFit) -> Prediction:
-    """Return measured and predicted motor torques."""
+def _positive_part(covariance: Array) -> Array:
+    """Return a symmetric matrix without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)
+
+
+def _prediction(
+    equations: _Equations, motors: Sequence[str], step: Array, noise_of_torques: Array, errors_of_motion: Array
+) -> Prediction:
+    """Return measured and predicted motor torques, and the variances of their difference.
+
+    These are the sums of those of the torques' noise, as given or as the fit estimated it, and of the errors of the
+    record's motion. Both are covariances of the equations, (d, d).
+    """
     residual = np.einsum("kmd,kd->km", equations.to_motors, equations.right - equations.columns @ step)
     names = tuple(f"tau.{motor}" for motor in motors)
-    variances = {name: _expected_variance(equations, k, name, fit) for k, name in enumerate(names)}
     record, tau = equations.record, equations.tau
+
+    def of_motors(covariance: Array) -> Array:
+        return np.einsum("kmd,de,kme->m", equations.to_motors, covariance, equations.to_motors) / len(tau)
+
+    noise = dict(zip(names, of_motors(noise_of_torques), strict=True)) | {
+        name: std**2 for name, std in record.noise.items() if name in names
+    }
+    of_motion = of_motors(errors_of_motion)
+    variances = {name: float(noise[name] + x) for name, x in zip(names, of_motion, strict=True)}
     return Prediction(record.source, record.validation, names, equations.motion.t, tau, tau - residual, variances)
-
-
-def _expected_variance(equations: _Equations, k: int, name: str, fit: LinearFit) -> float:
-    """Return the variance of a motor's torque residual: as given, or as the fit estimated it."""
-    std = equations.record.noise.get(name)
-    if std is not None:
-        return std**2
-    to_motor = equations.to_motors[:, k]
-    return float(np.mean(np.einsum("kd,de,ke->k", to_motor, fit.noise, to_motor)))
