@@ -58,7 +58,11 @@ def to_c(mechanism: Mechanism, stem: str) -> tuple[dict[str, str], list[str]]:
 
 
 def fill_templates(
-    mechanism: Mechanism, prefix: str, texts: Mapping[str, str], more: Mapping[str, str] | None = None
+    mechanism: Mechanism,
+    prefix: str,
+    texts: Mapping[str, str],
+    more: Mapping[str, str] | None = None,
+    derivatives: bool = False,
 ) -> dict[str, str]:
     """Return templates by file name with a mechanism's code, sizes and names.
 
@@ -70,8 +74,10 @@ def fill_templates(
     texts : mapping
     more : mapping, optional
         Further texts, which replace ``@KEY@``.
+    derivatives : bool
+        Whether the code has directional derivatives of the terms.
     """
-    functions = TermFunctions.of(mechanism, portable=True).functions
+    functions = TermFunctions.of(mechanism, portable=True, directional_derivatives=derivatives).functions
     enumerators = _enumerators(mechanism, prefix)
     substitutions = {
         **_sizes(mechanism, functions),

@@ -16,7 +16,10 @@ BASE_UNITS = {"N": {"kg": 1, "m": 1, "s": -2}, "J": {"kg": 1, "m": 2, "s": -2}}
 EXPONENTS = {"²": 2}
 IDENTIFIER = r"[A-Za-z_][A-Za-z0-9_]*"
 STRUCTURED_NAME = re.compile(rf"{IDENTIFIER}(\.{IDENTIFIER})*")
-FLAGS = {"2.0": "canGetAndSetFMUstate canSerializeFMUstate", "3.0": "canGetAndSetFMUState canSerializeFMUState"}
+FLAGS = {
+    "2.0": "canGetAndSetFMUstate canSerializeFMUstate providesDirectionalDerivative",
+    "3.0": "canGetAndSetFMUState canSerializeFMUState providesDirectionalDerivatives",
+}
 
 
 def describe_model(

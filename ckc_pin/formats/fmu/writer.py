@@ -146,7 +146,7 @@ def _write_sources(
         "E3": initializer(DOP853.E3),
         "E5": initializer(DOP853.E5),
     }
-    return fill_templates(mechanism, prefix, texts, more)
+    return fill_templates(mechanism, prefix, texts, more, derivatives=True)
 
 
 def _matrix(rows: Array) -> str:

@@ -119,18 +119,25 @@ static void compute_rho(mech_configuration *at) {
   }
 }
 
+/* Rotate s by the quaternion r (x, y, z, w). */
+static void rotate(const double *r, const double *s, double *rotated) {
+  const double x = r[0], y = r[1], z = r[2], w = r[3];
+  const double a = 2.0 * (y * s[2] - z * s[1]), b = 2.0 * (z * s[0] - x * s[2]), c = 2.0 * (x * s[1] - y * s[0]);
+  rotated[0] = s[0] + w * a + y * c - z * b;
+  rotated[1] = s[1] + w * b + z * a - x * c;
+  rotated[2] = s[2] + w * c + x * b - y * a;
+}
+
 /* Move the configuration by a tangent step. A free root moves along its own axes. */
 static void move(double *q_tree, const double *step) {
   for (int k = 0; k < JOINTS; ++k) q_tree[JOINT[k][0]] += step[JOINT[k][1]];
   for (int k = 0; k < ROOTS; ++k) {
-    double *p = q_tree + ROOT[k][0], *r = p + 3;
-    const double *s = step + ROOT[k][1], *half = s + 3;
+    double *p = q_tree + ROOT[k][0], *r = p + 3, shift[3];
+    const double *s = step + ROOT[k][1];
     const double x = r[0], y = r[1], z = r[2], w = r[3];
-    const double a = 2.0 * (y * s[2] - z * s[1]), b = 2.0 * (z * s[0] - x * s[2]), c = 2.0 * (x * s[1] - y * s[0]);
-    p[0] += s[0] + w * a + y * c - z * b;
-    p[1] += s[1] + w * b + z * a - x * c;
-    p[2] += s[2] + w * c + x * b - y * a;
-    const double u = 0.5 * half[0], v = 0.5 * half[1], t = 0.5 * half[2];
+    const double u = 0.5 * s[3], v = 0.5 * s[4], t = 0.5 * s[5];
+    rotate(r, s, shift);
+    for (int i = 0; i < 3; ++i) p[i] += shift[i];
     r[0] = x + w * u + y * t - z * v;
     r[1] = y + w * v + z * u - x * t;
     r[2] = z + w * t + x * v - y * u;
@@ -280,20 +287,24 @@ void mech_h(const mech_model *model, const mech_configuration *at, double *h) {
 
 /* --- dynamics --- */
 
-void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
-                      const double *u_tree, const double *acceleration, double *multipliers) {
-  double D_tree[MECH_N * MECH_N], force[MECH_N], bias_tree[MECH_N], damping[MECH_N];
-  double J_dot_v[MECH_SIZE(MECH_ROWS)], z[MECH_SIZE(MECH_Z)];
+/* Solve D' acceleration = force + J^T multipliers for the multipliers. */
+static void solve_multipliers(const mech_model *model, const mech_configuration *at, const double *force,
+                              const double *acceleration, double *multipliers) {
+  double D_tree[MECH_N * MECH_N], inertial[MECH_N], z[MECH_SIZE(MECH_Z)];
   mech_D_tree(model, at, D_tree);
-  mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
-  multiply(D_tree, acceleration, force, MECH_N, MECH_N);
-  for (int k = 0; k < MECH_Z; ++k) {
-    const int i = DEPENDENT[k];
-    z[k] = force[i] + bias_tree[i] - damping[i] - u_tree[i];
-  }
+  multiply(D_tree, acceleration, inertial, MECH_N, MECH_N);
+  for (int k = 0; k < MECH_Z; ++k) z[k] = inertial[DEPENDENT[k]] - force[DEPENDENT[k]];
   solve_transposed(at->phi_z, at->pivot, MECH_Z, z);
   for (int i = 0; i < MECH_ROWS; ++i) multipliers[i] = 0.0;
   for (int k = 0; k < MECH_Z; ++k) multipliers[KEPT[k]] = z[k];
+}
+
+void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                      const double *u_tree, const double *acceleration, double *multipliers) {
+  double force[MECH_N], bias_tree[MECH_N], damping[MECH_N], J_dot_v[MECH_SIZE(MECH_ROWS)];
+  mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
+  for (int k = 0; k < MECH_N; ++k) force[k] = u_tree[k] + damping[k] - bias_tree[k];
+  solve_multipliers(model, at, force, acceleration, multipliers);
 }
 
 mech_status mech_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,

@@ -228,15 +228,19 @@ FMI3_Export fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueRefe
   return report(c, fmi3Error, "dependencies are not known at run time");
 }
 
-#define DERIVATIVE_FUNCTION(Function)                                                                           \
-  FMI3_Export fmi3Status Function(fmi3Instance c, const fmi3ValueReference unknowns[], size_t n,                \
-                                  const fmi3ValueReference knowns[], size_t m, const fmi3Float64 seed[],        \
-                                  size_t seed_size, fmi3Float64 derivative[], size_t size) {                    \
-    (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)seed_size, (void)derivative, (void)size;  \
-    return report(c, fmi3Error, "there are no directional or adjoint derivatives");                             \
-  }
-DERIVATIVE_FUNCTION(fmi3GetDirectionalDerivative)
-DERIVATIVE_FUNCTION(fmi3GetAdjointDerivative)
+FMI3_Export fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, references unknowns, size_t n, references knowns,
+                                                    size_t m, const fmi3Float64 seed[], size_t seed_size,
+                                                    fmi3Float64 derivative[], size_t size) {
+  if (seed_size != m || size != n) return report(c, fmi3Error, "all variables are scalars");
+  return check(c, fmu_get_changes(&((instance *)c)->state, unknowns, n, knowns, m, seed, derivative));
+}
+
+FMI3_Export fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, references unknowns, size_t n, references knowns,
+                                                size_t m, const fmi3Float64 seed[], size_t seed_size,
+                                                fmi3Float64 derivative[], size_t size) {
+  (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)seed_size, (void)derivative, (void)size;
+  return report(c, fmi3Error, "there are no adjoint derivatives");
+}
 
 FMI3_Export fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference r[], size_t n,
                                                 const fmi3Int32 orders[], fmi3Float64 values[], size_t size) {

@@ -119,11 +119,13 @@ static void independent_rates(const fmu *x, double *q_dot) {
   for (int k = 0; k < MECH_D; ++k) q_dot[k] = x->values[RATE + INDEPENDENT[k]];
 }
 
+static int integrates_spf(const fmu *x) { return IS_SPF && x->is_model_exchange; }
+
 /* Move the configuration to the states. */
 static mech_status follow_states(fmu *x) {
   mech_configuration at = x->at;
   mech_status status;
-  if (IS_SPF && x->is_model_exchange) {
+  if (integrates_spf(x)) {
     double q_tree[MECH_NQ];
     memcpy(q_tree, at.q_tree, sizeof q_tree);
     for (int k = 0; k < JOINTS; ++k) q_tree[JOINT[k][0]] = x->values[POSITION + JOINT[k][1]];
@@ -141,24 +143,54 @@ static mech_status follow_states(fmu *x) {
   return status;
 }
 
+/* Solve D' a = force + J^T multipliers for an acceleration a whose part without q_ddot is z. */
+static mech_status project_acceleration(const fmu *x, const mech_configuration *at, const double *force,
+                                        const double *z, double *a) {
+  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], rest[MECH_N], q_ddot[MECH_D];
+  int pivot[MECH_D];
+  mech_D_tree(&x->model, at, D_tree);
+  project_inertia(at, D_tree, D);
+  if (!factorize(D, pivot, MECH_D)) return MECH_SINGULAR;
+  memset(a, 0, MECH_N * sizeof *a);
+  for (int k = 0; k < MECH_Z; ++k) a[DEPENDENT[k]] = z[k];
+  multiply(D_tree, a, rest, MECH_N, MECH_N);
+  for (int k = 0; k < MECH_N; ++k) rest[k] = force[k] - rest[k];
+  multiply_transposed(at->rho, rest, q_ddot, MECH_N, MECH_D);
+  solve(D, pivot, MECH_D, q_ddot);
+  multiply(at->rho, q_ddot, rest, MECH_N, MECH_D);
+  for (int k = 0; k < MECH_N; ++k) a[k] += rest[k];
+  return is_finite(a, MECH_N) ? MECH_OK : MECH_NOT_FINITE;
+}
+
+/* The acceleration dv'/dt of eq. 6 at the velocity q_dot under the force u_tree. */
+static mech_status accelerate(const fmu *x, const mech_configuration *at, const double *q_dot, const double *u_tree,
+                              double *a) {
+  double v_tree[MECH_N], force[MECH_N], bias_tree[MECH_N], damping[MECH_N];
+  double J_dot_v[MECH_SIZE(MECH_ROWS)], z[MECH_SIZE(MECH_Z)];
+  mech_velocity(at, q_dot, v_tree);
+  mech_bias_tree(&x->model, at, v_tree, bias_tree, J_dot_v, damping);
+  for (int k = 0; k < MECH_N; ++k) force[k] = u_tree[k] + damping[k] - bias_tree[k];
+  close_rows(at, J_dot_v, z);
+  return project_acceleration(x, at, force, z, a);
+}
+
 /* Compute rates and accelerations of the states, by eq. 6 or eq. 8. */
 static mech_status fmu_differentiate(fmu *x) {
-  double u_tree[MECH_N], q_dot[MECH_D], q_ddot[MECH_D];
+  double u_tree[MECH_N], q_dot[MECH_D];
   mech_status status = fmu_assemble(x);
   if (status != MECH_OK || x->has_derivatives) return status;
   status = follow_states(x);
   if (status != MECH_OK) return status;
   independent_rates(x, q_dot);
   input_force(x, u_tree);
-  status = mech_forward_dynamics(&x->model, &x->at, q_dot, u_tree, q_ddot);
+  status = accelerate(x, &x->at, q_dot, u_tree, x->values + ACCELERATION);
   if (status != MECH_OK) return status;
   mech_velocity(&x->at, q_dot, x->values + RATE);
-  if (IS_SPF && x->is_model_exchange) {
+  if (integrates_spf(x)) {
     double z_dot[MECH_SIZE(MECH_Z)];
     close_rows(&x->at, x->at.phi, z_dot);
     for (int k = 0; k < MECH_Z; ++k) x->values[RATE + DEPENDENT[k]] += z_dot[k] / x->values[EPSILON];
   }
-  for (int k = 0; k < MECH_D; ++k) x->values[ACCELERATION + INDEPENDENT[k]] = q_ddot[k];
   x->has_derivatives = 1;
   x->has_outputs = 0;
   return MECH_OK;
@@ -176,15 +208,13 @@ static void locate_root(const double *p, double *location) {
 }
 
 static mech_status fmu_compute_outputs(fmu *x) {
-  double *const values = x->values, q_dot[MECH_D], q_ddot[MECH_D], v_tree[MECH_N], u_tree[MECH_N];
+  double *const values = x->values, q_dot[MECH_D], v_tree[MECH_N], u_tree[MECH_N];
   double D_tree[MECH_N * MECH_N], momentum[MECH_N];
   const mech_status status = fmu_differentiate(x);
   if (status != MECH_OK || x->has_outputs) return status;
   independent_rates(x, q_dot);
   input_force(x, u_tree);
   mech_velocity(&x->at, q_dot, v_tree);
-  for (int k = 0; k < MECH_D; ++k) q_ddot[k] = values[ACCELERATION + INDEPENDENT[k]];
-  mech_tree_acceleration(&x->model, &x->at, v_tree, q_ddot, values + ACCELERATION);
   mech_multipliers(&x->model, &x->at, v_tree, u_tree, values + ACCELERATION, values + MULTIPLIER);
   mech_points(&x->model, &x->at, values + RATE, values + POINT, values + POINT_RATE);
   read_joint_positions(x);
@@ -201,6 +231,79 @@ static mech_status fmu_compute_outputs(fmu *x) {
   return MECH_OK;
 }
 
+/* --- directional derivatives --- */
+
+/* The change of rates x with J x = -decay phi, for a step of the configuration and changes of the independent rates. */
+static void change_rates(const fmu *x, const double *rates, double decay, const double *step, const double *q_dot_change,
+                         double *changes) {
+  const mech_configuration *at = &x->at;
+  double row[MECH_SIZE(MECH_Z)], phi_change[MECH_SIZE(MECH_ROWS)];
+  code_loop_rate_change(at->q_tree, at->trig, rates, step, x->model.numbers, row);
+  multiply(at->J, step, phi_change, MECH_ROWS, MECH_N);
+  for (int k = 0; k < MECH_Z; ++k) row[k] = -row[k] - decay * phi_change[KEPT[k]];
+  solve(at->phi_z, at->pivot, MECH_Z, row);
+  multiply(at->rho, q_dot_change, changes, MECH_N, MECH_D);
+  for (int k = 0; k < MECH_Z; ++k) changes[DEPENDENT[k]] += row[k];
+}
+
+/* The change of a free root's position and rotation vector by a step along its own axes. */
+static void change_location(const double *p, const double *step, double *change) {
+  double location[6], once[3], twice[3];
+  locate_root(p, location);
+  rotate(p + 3, step, change);
+  const double *r = location + 3, *s = step + 3;
+  const double angle = sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2]);
+  const double factor = angle > 0.0 ? (1.0 - 0.5 * angle / tan(0.5 * angle)) / (angle * angle) : 0.0;
+  for (int i = 0; i < 3; ++i) once[i] = r[(i + 1) % 3] * s[(i + 2) % 3] - r[(i + 2) % 3] * s[(i + 1) % 3];
+  for (int i = 0; i < 3; ++i) twice[i] = r[(i + 1) % 3] * once[(i + 2) % 3] - r[(i + 2) % 3] * once[(i + 1) % 3];
+  for (int i = 0; i < 3; ++i) change[3 + i] = s[i] + 0.5 * once[i] + factor * twice[i];
+}
+
+/* The changes of all outputs with those of inputs and states in `change`, by differentiation of eqs. 1, 6 and 8. */
+static mech_status change_outputs(const fmu *x, double *change) {
+  const mech_configuration *at = &x->at;
+  const double *values = x->values, *numbers = x->model.numbers;
+  double q_dot[MECH_D], q_change[MECH_D], q_dot_change[MECH_D], step[MECH_N], tau[MECH_SIZE(MECH_MOTORS)];
+  double v_tree[MECH_N], v_change[MECH_N], rate_change[MECH_N], residual[MECH_N + MECH_Z], force[MECH_N];
+  double kept[MECH_SIZE(MECH_Z)], z[MECH_SIZE(MECH_Z)], phi_change[MECH_SIZE(MECH_ROWS)];
+  for (int k = 0; k < MECH_D; ++k) {
+    q_change[k] = change[POSITION + INDEPENDENT[k]];
+    q_dot_change[k] = change[RATE + INDEPENDENT[k]];
+  }
+  multiply(at->rho, q_change, step, MECH_N, MECH_D);
+  if (integrates_spf(x)) memcpy(step, change + POSITION, sizeof step);
+  independent_rates(x, q_dot);
+  mech_velocity(at, q_dot, v_tree);
+  change_rates(x, v_tree, 0.0, step, q_dot_change, v_change);
+  memcpy(rate_change, v_change, sizeof rate_change);
+  if (integrates_spf(x)) change_rates(x, values + RATE, 1.0 / values[EPSILON], step, q_dot_change, rate_change);
+  for (int k = 0; k < MECH_MOTORS; ++k) {
+    const double torque = values[TORQUE + k];
+    tau[k] = torque >= LOWEST_TAU[k] && torque <= HIGHEST_TAU[k] ? change[TORQUE + k] : 0.0;
+  }
+  mech_motor_force(tau, force);
+  for (int k = 0; k < MECH_Z; ++k) kept[k] = values[MULTIPLIER + KEPT[k]];
+  code_residual_change(at->q_tree, at->trig, v_tree, values + ACCELERATION, kept, step, v_change, numbers, residual);
+  for (int k = 0; k < MECH_N; ++k) force[k] += change[FORCE + k] - residual[k];
+  for (int k = 0; k < MECH_Z; ++k) z[k] = -residual[MECH_N + k];
+  solve(at->phi_z, at->pivot, MECH_Z, z);
+  const mech_status status = project_acceleration(x, at, force, z, change + ACCELERATION);
+  if (status != MECH_OK) return status;
+  solve_multipliers(&x->model, at, force, change + ACCELERATION, change + MULTIPLIER);
+  memcpy(change + RATE, rate_change, sizeof rate_change);
+  code_point_changes(at->q_tree, at->trig, values + RATE, step, rate_change, numbers, change + POINT,
+                     change + POINT_RATE);
+  for (int k = 0; k < JOINTS; ++k) change[POSITION + JOINT[k][1]] = step[JOINT[k][1]];
+  for (int k = 0; k < ROOTS; ++k)
+    change_location(at->q_tree + ROOT[k][0], step + ROOT[k][1], change + POSITION + ROOT[k][1]);
+  code_energy_changes(at->q_tree, at->trig, v_tree, step, v_change, numbers, change + KINETIC, change + POTENTIAL);
+  change[TOTAL] = change[KINETIC] + change[POTENTIAL];
+  multiply(at->J, step, phi_change, MECH_ROWS, MECH_N);
+  for (int k = 0; k < MECH_ROWS; ++k)
+    if (fabs(at->phi[k]) == values[RESIDUAL]) change[RESIDUAL] = at->phi[k] < 0.0 ? -phi_change[k] : phi_change[k];
+  return is_finite(change, VARIABLES) ? MECH_OK : MECH_NOT_FINITE;
+}
+
 /* --- values by reference --- */
 
 static int is_start_value(unsigned reference) {
@@ -211,13 +314,14 @@ static int is_start_value(unsigned reference) {
 
 /* The functions below that return a text return NULL, or why they failed. */
 
+static int is_input(unsigned reference) { return (int)reference >= TORQUE && (int)reference < POSITION; }
+
 static const char *set_value(fmu *x, unsigned reference, double value) {
-  const int is_input = (int)reference >= TORQUE && (int)reference < POSITION;
-  if (!is_input && !is_start_value(reference)) return "only inputs, parameters and start values can be set";
-  if (!is_input && !x->is_initializing) return "parameters and start values can only be set before the end of initialization";
+  if (!is_input(reference) && !is_start_value(reference)) return "only inputs, parameters and start values can be set";
+  if (!is_input(reference) && !x->is_initializing) return "parameters and start values can only be set before the end of initialization";
   if (!(fabs(value) <= DBL_MAX)) return REASON[MECH_NOT_FINITE];
   x->values[reference] = value;
-  if (!is_input) x->is_assembled = 0;
+  if (!is_input(reference)) x->is_assembled = 0;
   x->has_derivatives = 0;
   return NULL;
 }
@@ -240,6 +344,30 @@ static const char *fmu_get(fmu *x, const unsigned *references, size_t n, double 
   const char *reason = NULL;
   for (size_t k = 0; k < n && reason == NULL; ++k) reason = get_value(x, references[k], &values[k]);
   return reason;
+}
+
+static int is_state(const fmu *x, int reference) {
+  for (int k = 0; k < MECH_D; ++k)
+    if (reference == POSITION + INDEPENDENT[k] || reference == RATE + INDEPENDENT[k]) return 1;
+  return integrates_spf(x) && reference >= POSITION && reference < RATE;
+}
+
+/* Directional derivatives of outputs and of the states' derivatives by inputs and states. */
+static const char *fmu_get_changes(fmu *x, const unsigned *unknowns, size_t n, const unsigned *knowns, size_t m,
+                                   const double *seed, double *derivatives) {
+  double change[VARIABLES] = {0.0};
+  mech_status status = fmu_compute_outputs(x);
+  for (size_t k = 0; k < m; ++k) {
+    if (!is_input(knowns[k]) && !is_state(x, (int)knowns[k])) return "directional derivatives are by inputs and states";
+    change[knowns[k]] += seed[k];
+  }
+  if (status == MECH_OK) status = change_outputs(x, change);
+  if (status != MECH_OK) return REASON[status];
+  for (size_t k = 0; k < n; ++k) {
+    if ((int)unknowns[k] < POSITION || unknowns[k] >= VARIABLES) return "directional derivatives are of outputs";
+    derivatives[k] = change[unknowns[k]];
+  }
+  return NULL;
 }
 
 /* --- copies of the FMU's state --- */
@@ -303,7 +431,11 @@ static mech_status reduced_rate(const fmu *x, const double *u_tree, const double
                                 double *rate) {
   for (int k = 0; k < MECH_D; ++k) rate[k] = y[MECH_D + k];
   const mech_status status = mech_sigma(&x->model, y, at);
-  return status == MECH_OK ? mech_forward_dynamics(&x->model, at, y + MECH_D, u_tree, rate + MECH_D) : status;
+  if (status != MECH_OK) return status;
+  double a[MECH_N];
+  const mech_status result = accelerate(x, at, y + MECH_D, u_tree, a);
+  for (int k = 0; k < MECH_D; ++k) rate[MECH_D + k] = a[INDEPENDENT[k]];
+  return result;
 }
 
 /* Return the error of a step relative to its tolerance. */
