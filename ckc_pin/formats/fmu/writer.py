@@ -140,6 +140,7 @@ def _write_sources(
         "RTOL": repr(rtol),
         "START": initializer(start.at.q_tree),
         "START_RATES": initializer(start.q_dot),
+        "STATE": initializer(sorted(mechanism.partition.q.tolist())),
         "STAGES": str(len(DOP853.B)),
         "A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
         "B": initializer(DOP853.B),

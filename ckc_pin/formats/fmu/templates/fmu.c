@@ -33,6 +33,7 @@ enum { ASSEMBLY_PIECES = 64, STAGES = @STAGES@ };
 static const char IDENTITY[] = "@IDENTITY@"; /* of the model description */
 static const double START[] = @START@;       /* configuration q_tree of the scene's start */
 static const double START_RATES[] = @START_RATES@;
+static const int STATE[] = @STATE@; /* places of q in v_tree, in the order of the model description */
 
 /* DOP853: E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary Differential Equations I, section II.10. */
 static const double A[STAGES][STAGES] = @A@;
@@ -400,8 +401,8 @@ static const char *fmu_deserialize(const void *bytes, size_t size, void **copy) 
 /* Place of a state in `values`: positions, of q or of all coordinates, then q_dot. Its derivative is MECH_N places on. */
 static int state_place(int k) {
   const int positions = STATES - MECH_D;
-  if (k >= positions) return RATE + INDEPENDENT[k - positions];
-  return IS_SPF ? POSITION + k : POSITION + INDEPENDENT[k];
+  if (k >= positions) return RATE + STATE[k - positions];
+  return IS_SPF ? POSITION + k : POSITION + STATE[k];
 }
 
 static const char WRONG_NUMBER[] = "wrong number of states";
