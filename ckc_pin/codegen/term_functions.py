@@ -36,8 +36,8 @@ FUNCTIONS = {
 PORTABLE_FUNCTIONS = {
     name: FUNCTIONS[name] for name in ("place", "inertia", "bias", "rest", "potential_energy", "acceleration")
 } | {"bilinear": (("q", "v", "x"), ("bias_x", "J_dot_x")), "points": (("q", "v"), ("positions", "velocities"))}
-# Of exported FMUs: derivatives along a `step` of q' in tangent coordinates and a change of v'. `residual_change` is that
-# of eq. 1 at an acceleration `a` and the kept rows' `multipliers`; `loop_rate_change` that of J v' for the kept rows.
+# Of exported FMUs: derivatives along a `step` of q' in tangent coordinates and a change of v'. `residual_change` is
+# that of eq. 1 at an acceleration `a` and the kept rows' `multipliers`; `loop_rate_change` of the kept rows of J v'.
 PORTABLE_DERIVATIVES = {
     "residual_change": (("q", "v", "a", "multipliers", "step", "v_change"), ("residual_change",)),
     "loop_rate_change": (("q", "v", "step"), ("loop_rate_change",)),

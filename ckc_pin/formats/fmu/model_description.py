@@ -64,7 +64,7 @@ def describe_model(
         },
     )
     if is_old:
-        root.set("numberOfEventIndicators", "0")
+        root.set("numberOfEventIndicators", str(sum(x.is_event_indicator for x in variables)))
     for kind in ("ModelExchange", "CoSimulation"):
         interface = SubElement(root, kind, {"modelIdentifier": identifier})
         for flag in FLAGS[fmi].split():
@@ -162,6 +162,9 @@ def _add_structure(root: Element, variables: Sequence[Variable], is_old: bool) -
                 SubElement(parent, "Unknown", {"index": index[variable.reference]})
             else:
                 SubElement(parent, new, {"valueReference": str(variable.reference)})
+    for variable in variables:
+        if variable.is_event_indicator and not is_old:
+            SubElement(structure, "EventIndicator", {"valueReference": str(variable.reference)})
 
 
 def _indices(variables: Sequence[Variable]) -> dict[int, str]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.arguments import argument_names, argument_units, present, values
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.units import effort, joined, motor_units, row_units
 
-__all__ = ["Variable", "list_variables"]
+__all__ = ["Variable", "list_stops", "list_variables"]
 
 AXES = ("x", "y", "z")
+STOP = "distance from the stop, or its force while the joint rests on it: an event indicator"
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Variable:
     description : str
     derivative_of : int or None
         Value reference of the state whose derivative it is.
+    is_event_indicator : bool
     """
 
     name: str
@@ -46,6 +50,7 @@ class Variable:
     unit: str = ""
     description: str = ""
     derivative_of: int | None = None
+    is_event_indicator: bool = False
 
 
 def list_variables(
@@ -78,6 +83,17 @@ def list_variables(
             variables[k] = variable = replace(variable, name=renamed[variable.name])
         variables[k] = replace(variable, derivative_of=derivative_of.get(k))
     return [x for x in variables if x.name != "epsilon" or epsilon is not None], renamed
+
+
+def list_stops(mechanism: Mechanism) -> list[tuple[int, int, float]]:
+    """Return the coordinate, the side, 1 for the upper one or -1, and the position of each stop of a mechanism."""
+    bounds = zip(mechanism.joints.lower, mechanism.joints.upper, strict=True)
+    return [
+        (k, side, float(x))
+        for k, both in enumerate(bounds)
+        for side, x in zip((-1, 1), both, strict=True)
+        if np.isfinite(x)
+    ]
 
 
 def _by_name(variables: Sequence[Variable]) -> dict[str, list[Variable]]:
@@ -123,6 +139,9 @@ def _iterate_variables(mechanism: Mechanism, q_tree: Array, q_dot: Array, epsilo
         yield _output(f"energy.{name}", "J", "energy")
     row_unit = joined(row_units(mechanism))
     yield _output("phi.max", row_unit if " or " not in row_unit else "", "largest residual of the loops")
+    for k, side, _ in list_stops(mechanism):
+        indicator = _output(f"stop.{coordinates[k]}.{'lower' if side < 0 else 'upper'}", "", STOP)
+        yield replace(indicator, is_event_indicator=True)
 
 
 def _output(name: str, unit: str, description: str, start: float | None = None) -> Variable:
