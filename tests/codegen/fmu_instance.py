@@ -30,7 +30,7 @@ class Instance:
         Start values and parameters.
     tolerance : float
     messages : list of str, optional
-        Gets the messages of the FMU's logger.
+        Gets the messages of the FMU's logger. FMPy sends those of all FMUs 2.0 to the one that was made last.
     """
 
     def __init__(

@@ -277,7 +277,7 @@ def test_without_a_compiler_the_fmu_has_sources_only(tmp_path: Path, monkeypatch
 REFUSED = {
     "controller": ("five_bar", {}, "a controller is not exported.*--unset controller"),
     "sampled": ("five_bar", {"controller.sample_time": 0.01}, "a sampled controller is not exported"),
-    "stops": ("five_bar/friction", {"controller": None}, "stops of theta_1, theta_3 are not supported"),
+    "friction": ("five_bar/friction", {"controller": None}, "dry friction of theta_1, .* is not supported"),
     "forces": (
         "five_bar/swing",
         {"force": [{"frame": "link_2", "force": [1.0, 0.0, 0.0]}]},

@@ -63,8 +63,7 @@ static const char *const REASON[] = {
     "elimination lost accuracy",
     "the motors cannot produce every u",
     "a joint is beyond its stop: choose start values within the stops",
-    "joints that only move together touch several stops at once, which the FMU does not support: remove all but one of "
-    "these stops",
+    "joints that only move together touch several stops at once: remove all of these stops but one",
     "the step size of the integration became too small",
 };
 
@@ -201,7 +200,7 @@ static void find_responses(const mech_configuration *at, const double *D_tree, c
 static mech_status hold(const contact *c, const double *b, double *x) {
   double A[STOP_SIZE * STOP_SIZE];
   int pivot[STOP_SIZE];
-  memcpy(A, c->A, sizeof A);
+  for (int i = 0; i < c->count * c->count; ++i) A[i] = c->A[i];
   for (int i = 0; i < c->count; ++i) x[i] = -b[i];
   if (!factorize(A, pivot, c->count)) return (mech_status)DEPENDENT_STOPS;
   solve(A, pivot, c->count, x);

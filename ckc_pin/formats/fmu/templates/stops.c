@@ -12,7 +12,7 @@
    and of A's diagonal are about one. Return 0 if A is singular. */
 static int minimize(const double *A, const double *b, const int *is_free, int m, double *x) {
   double matrix[STOP_SIZE * STOP_SIZE], trial[STOP_SIZE];
-  int is_passive[STOP_SIZE], passive[STOP_SIZE], pivot[STOP_SIZE], needs_step = 0;
+  int is_passive[STOP_SIZE], passive[STOP_SIZE] = {0}, pivot[STOP_SIZE], needs_step = 0;
   for (int i = 0; i < m; ++i) {
     x[i] = 0.0;
     is_passive[i] = is_free[i];
@@ -78,7 +78,7 @@ static void scale_contact(const contact *c, double *scale, double *A) {
 
 /* Reflect the stops that are listed, with impulses that are not negative unless `is_free`. */
 static int reflect(impact *x, const int *which, int count, const int *is_free, double restitution) {
-  double A[STOP_SIZE * STOP_SIZE], b[STOP_SIZE], before[STOP_SIZE], impulse[STOP_SIZE], size = 0.0;
+  double A[STOP_SIZE * STOP_SIZE] = {0.0}, b[STOP_SIZE] = {0.0}, before[STOP_SIZE], impulse[STOP_SIZE], size = 0.0;
   for (int i = 0; i < count; ++i) size = fmax(size, fabs(before[i] = x->rate[which[i]]));
   for (int j = 0; j < count; ++j) {
     b[j] = before[j] / size;
