@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -24,6 +25,7 @@ from ckc_pin.codegen.arguments import argument_names, present, values
 from ckc_pin.formats.exporting import export, write
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.scene.parts import load_scene_mechanism
+from tests.codegen.fmu_instance import Instance
 from tests.codegen.test_export_c import WARNINGS, make_mechanism, run
 from tests.contract.helpers.command import ckc
 
@@ -218,9 +220,47 @@ def test_state_can_be_saved_and_restored(fmu_of: Callable[[str, str], Path]) -> 
     fmu.freeInstance()
 
 
-def test_start_that_cannot_be_assembled_is_an_error(fmu_of: Callable[[str, str], Path]) -> None:
-    with pytest.raises(FMICallException, match="fmi2ExitInitializationMode failed"):
-        instantiate(fmu_of("five_bar", "2.0"), {"theta_1": -3.0, "theta_3": 0.0})
+BAD_VALUES = {
+    "start out of reach": ("five_bar", {"theta_1": -3.0, "theta_3": 0.0}, "the loops cannot be closed: coordinates or"),
+    "link too long": (
+        "five_bar",
+        {"joint.theta_2.xyz.x": 5.0},
+        "the loops cannot be closed: coordinates or parameters",
+    ),
+    "NaN": ("five_bar", {"joint.theta_2.xyz.x": float("nan")}, "a value is not a finite number"),
+    "infinite": ("delta", {"gravity.z": float("inf")}, "a value is not a finite number"),
+    "epsilon": ("five_bar_spf", {"epsilon": 0.0}, "epsilon must be positive"),
+    "dependent": ("five_bar", {"theta_2": 0.1}, "only inputs, parameters and start values can be set"),
+}
+
+
+@pytest.mark.parametrize("fmi", FMI)
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_bad_values_are_errors_with_a_message(case: str, fmi: str, fmu_of: Callable[[str, str], Path]) -> None:
+    name, values, expected = BAD_VALUES[case]
+    messages: list[str] = []
+    with pytest.raises(FMICallException):
+        Instance(fmu_of(name, fmi), "ModelExchange", values, messages=messages)
+    assert len(messages) == 1
+    assert messages[0].startswith(expected)
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_singular_phi_z_on_the_way_is_an_error(fmi: str, tmp_path: Path) -> None:
+    """A run of the reduced model changes its independent coordinates there, and an FMU cannot."""
+    scene = load_scene("three_rrr", {"formulation": "reduced"})
+    (path,) = write(export(scene, "fmu", fmi=fmi), tmp_path)
+    fmu, messages = Instance(path, "CoSimulation"), list[str]()
+    for k in range(60):
+        before = fmu.get(["a_1", "phi.max"])
+        with suppress(FMICallException):
+            fmu.fmu.doStep(OUTPUT_DT * k, OUTPUT_DT)
+        if messages := fmu.messages:
+            break
+    (message,) = messages
+    assert message.startswith("phi_z is singular: the independent coordinates do not determine the configuration")
+    assert k > 30
+    np.testing.assert_array_equal(fmu.get(["a_1", "phi.max"]), before)  # the motion is as before the step
 
 
 def test_other_model_descriptions_are_refused(fmu_of: Callable[[str, str], Path]) -> None:

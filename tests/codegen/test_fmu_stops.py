@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import fmpy
 import numpy as np
@@ -18,6 +19,7 @@ from ckc_pin.formats.exporting import export, write
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.codegen.fmu_instance import Instance
+from tests.codegen.test_export_c import SANITIZERS, run
 
 RTOL, SOLVER_TOLERANCE = 1e-11, 1e-10
 EXACT = 1e-9  # relative: co-simulation against `simulate`
@@ -166,3 +168,13 @@ def test_stops_that_jam_a_mechanism_are_an_error(tmp_path: Path) -> None:
     scene = slider_crank(tmp_path / "mechanism", crank=1.3, low=SLIDER)
     (message,) = failing_messages(export_fmu(scene, tmp_path, "2.0"), {})
     assert message.startswith("joints that only move together touch several stops at once")
+
+
+def test_fmu_has_no_undefined_behaviour(tmp_path: Path) -> None:
+    with ZipFile(export_fmu(five_bar("comes to rest"), tmp_path, "2.0")) as archive:
+        archive.extractall(tmp_path)
+    harness = Path(__file__).parent / "fmu_harness.c"
+    run("gcc", *SANITIZERS, "-Isources", harness, "-lm", "-o", "checked", cwd=tmp_path)
+    messages = run("./checked", cwd=tmp_path)
+    assert messages.count("a value is not a finite number") == 4
+    assert messages.count("epsilon must be positive") == 2

@@ -57,8 +57,8 @@ enum { BEYOND_STOP = MECH_UNDRIVEN + 1, DEPENDENT_STOPS, STEP_TOO_SMALL };
 
 static const char *const REASON[] = {
     "no error",
-    "the loops cannot be closed: the coordinates are out of reach, or a step is too long",
-    "phi_z is singular: the independent coordinates do not determine the configuration",
+    "the loops cannot be closed: coordinates or parameters are out of reach, or a step is too long",
+    "phi_z is singular: the independent coordinates do not determine the configuration; export the scene with others",
     "a value is not a finite number",
     "elimination lost accuracy",
     "the motors cannot produce every u",
@@ -418,6 +418,7 @@ static const char *set_value(fmu *x, unsigned reference, double value) {
   if (!is_input(reference) && !is_start_value(reference)) return "only inputs, parameters and start values can be set";
   if (!is_input(reference) && !x->is_initializing) return "parameters and start values can only be set before the end of initialization";
   if (!(fabs(value) <= DBL_MAX)) return REASON[MECH_NOT_FINITE];
+  if (reference == EPSILON && value <= 0.0) return "epsilon must be positive";
   x->values[reference] = value;
   if (!is_input(reference)) x->is_assembled = 0;
   x->has_derivatives = 0;
