@@ -5,6 +5,7 @@
 #define REFLECTION_ROUNDING 1e-10
 #define RATE_ROUNDING 1e-11    /* relative to the fastest coordinate */
 #define MIN_RISE 1e-10         /* of a bounce; rad, or sizes of the mechanism */
+#define EVENT_OFFSET 1e-12     /* rad, or sizes of the mechanism */
 #define STOP_OFFSET_FACTOR 4.0 /* smallest rise of a bounce, relative to the joint's distance from its stop */
 #define ACCELERATION_ROUNDING 1e-9
 
@@ -132,9 +133,32 @@ static int resolve_impact(impact *x) {
   return 1;
 }
 
-/* The distance from a stop, or the force of the stop if a joint rests on it. A state event is where it becomes negative. */
+/* The distance from a stop, or the force of the stop if a joint rests on it. A state event is where it becomes negative.
+   In model exchange it is positive after an impact, so that the importer sees the change of its sign at the next one. */
 static double find_margin(const fmu *x, const mech_configuration *at, const double *holding, int i) {
-  return x->is_touching[i] ? holding[i] + NO_FORCE[i] : find_gap(at, i);
+  if (x->is_touching[i]) return holding[i] + NO_FORCE[i];
+  return find_gap(at, i) + (x->is_model_exchange ? EVENT_OFFSET * SCALE[STOPPED[i]] : 0.0);
+}
+
+/* Move joints out of the stops that `is_near` selects, as far as the importer's solver has moved them into these. */
+static mech_status push_out(fmu *x, const int *is_near) {
+  double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], step[MECH_N] = {0.0}, size = 0.0;
+  double A[STOP_SIZE * STOP_SIZE], scale[STOP_SIZE], b[STOP_SIZE], distance[STOP_SIZE];
+  const int none[STOP_SIZE] = {0};
+  int pivot[MECH_D];
+  contact c;
+  const mech_status status = factorize_inertia(x, &x->at, D_tree, D, pivot);
+  if (status != MECH_OK) return status;
+  find_responses(&x->at, D_tree, D, pivot, is_near, &c);
+  scale_contact(&c, scale, A);
+  for (int j = 0; j < c.count; ++j) size = fmax(size, fabs(b[j] = scale[j] * find_gap(&x->at, c.which[j])));
+  for (int j = 0; j < c.count; ++j) b[j] /= fmax(size, DBL_MIN);
+  if (!minimize(A, b, none, c.count, distance)) return (mech_status)DEPENDENT_STOPS;
+  for (int j = 0; j < c.count; ++j) distance[j] *= size * scale[j];
+  push(&x->at, &c, distance, step);
+  for (int k = 0; k < JOINTS; ++k) x->values[POSITION + JOINT[k][1]] += step[JOINT[k][1]];
+  x->has_derivatives = 0;
+  return fmu_differentiate(x);
 }
 
 /* Resolve an impact of joints at the stops that `is_near` selects, and select those on which joints rest. `held` are
@@ -150,6 +174,7 @@ static mech_status resolve_stops(fmu *x, const double *held, int *is_near) {
   independent_rates(x, q_dot);
   mech_velocity(&x->at, q_dot, v_tree);
   for (int k = 0; k < MECH_N; ++k) fastest = fmax(fastest, fabs(v_tree[k]) / SCALE[k]);
+  const double min_rise = fmax(MIN_RISE, 0.01 * x->tolerance);
   memset(&hit, 0, sizeof hit);
   hit.m = c.count;
   scale_contact(&c, hit.scale, hit.A);
@@ -157,7 +182,7 @@ static mech_status resolve_stops(fmu *x, const double *held, int *is_near) {
     const int i = c.which[j];
     const double size = SCALE[STOPPED[i]];
     const double returns = -fmin(gap_rate(x->values + ACCELERATION, i), gap_rate(held, i));
-    const double rise = fmax(fmax(MIN_RISE, 0.01 * x->tolerance) * size, STOP_OFFSET_FACTOR * fabs(find_gap(&x->at, i)));
+    const double rise = fmax(min_rise * size, STOP_OFFSET_FACTOR * fabs(find_gap(&x->at, i)));
     hit.rate[j] = hit.scale[j] * gap_rate(v_tree, i);
     hit.restitution[j] = RESTITUTION[i];
     hit.rest[j] = hit.scale[j] * RATE_ROUNDING * fastest * size;
@@ -215,7 +240,7 @@ static mech_status choose_holding(fmu *x, const int *is_resting, const int *pull
 /* Update velocities and contacts at an event: an impact, a joint that leaves its stop, or a change of inputs. */
 static mech_status update_stops(fmu *x) {
   double held[MECH_N], fastest = 0.0;
-  int is_near[STOP_SIZE], pulls[STOP_SIZE], any = 0, approaches = 0;
+  int is_near[STOP_SIZE], pulls[STOP_SIZE], is_lost[STOP_SIZE], any = 0, approaches = 0;
   mech_status status = fmu_differentiate(x);
   if (status != MECH_OK || STOPS == 0) return status;
   memcpy(held, x->values + ACCELERATION, sizeof held);
@@ -225,10 +250,14 @@ static mech_status update_stops(fmu *x) {
     const double slow = RATE_ROUNDING * fastest * size;
     is_near[i] = x->is_touching[i] || find_gap(&x->at, i) <= STOP_TOLERANCE * size + RATE_ROUNDING * fabs(rate);
     pulls[i] = x->is_touching[i] && x->holding[i] < 0.0;
+    /* A joint that leaves its stop cannot be beyond it: the importer's solver does not resolve the bounce, which ends. */
+    is_lost[i] = x->is_model_exchange && find_margin(x, &x->at, x->holding, i) < 0.0;
     approaches |= is_near[i] && !x->is_touching[i] && rate < -slow;
     any |= is_near[i];
   }
   if (!any) return MECH_OK;
+  if (x->is_model_exchange) status = push_out(x, is_near);
+  if (status != MECH_OK) return status;
   if (approaches) {
     memset(x->is_touching, 0, sizeof x->is_touching);
     x->has_derivatives = 0;
@@ -236,7 +265,8 @@ static mech_status update_stops(fmu *x) {
     if (status == MECH_OK) status = resolve_stops(x, held, is_near);
   } else {
     for (int i = 0; i < STOPS; ++i)
-      is_near[i] &= x->is_touching[i] || gap_rate(x->values + RATE, i) <= RATE_ROUNDING * fastest * SCALE[STOPPED[i]];
+      is_near[i] &= x->is_touching[i] || is_lost[i] ||
+                    gap_rate(x->values + RATE, i) <= RATE_ROUNDING * fastest * SCALE[STOPPED[i]];
     memset(x->is_touching, 0, sizeof x->is_touching);
     x->has_derivatives = 0;
   }
