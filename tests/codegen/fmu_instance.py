@@ -14,7 +14,9 @@ from fmpy.simulation import instantiate_fmu
 
 from ckc_pin.base.arrays import Array
 
-__all__ = ["Instance"]
+__all__ = ["Instance", "pointer_to"]
+
+ALIVE: list[Any] = []  # FMPy calls the logger of the FMU 2.0 that was made last, also after it is gone
 
 
 class Instance:
@@ -31,6 +33,8 @@ class Instance:
     tolerance : float
     messages : list of str, optional
         Gets the messages of the FMU's logger. FMPy sends those of all FMUs 2.0 to the one that was made last.
+    guid : str, optional
+        Instead of the one in the model description.
     """
 
     def __init__(
@@ -40,10 +44,13 @@ class Instance:
         values: Mapping[str, float] | None = None,
         tolerance: float = 1e-11,
         messages: list[str] | None = None,
+        guid: str | None = None,
     ) -> None:
+        ALIVE.append(self)
         # A library must not be overwritten while it is loaded.
         folder = fmpy.extract(str(path), mkdtemp(dir=path.parent))
         self.description = fmpy.read_model_description(folder)
+        self.description.guid = guid or self.description.guid
         self.is_old = self.description.fmiVersion == "2.0"
         self.messages: list[str] = [] if messages is None else messages
         self.fmu: Any = instantiate_fmu(folder, self.description, kind, logger=self._log)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -13,9 +14,11 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.units import effort, joined, motor_units, row_units
 
-__all__ = ["Variable", "list_stops", "list_variables"]
+__all__ = ["Variable", "list_stops", "list_variables", "to_xml_name"]
 
 AXES = ("x", "y", "z")
+# Characters that XML, or a normalized string of XML, cannot have.
+NOT_IN_XML = re.compile("[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 STOP = "distance from the stop, or its force while the joint rests on it: an event indicator"
 
 
@@ -56,7 +59,7 @@ class Variable:
 def list_variables(
     mechanism: Mechanism, q_tree: Array, q_dot: Array, epsilon: float | None
 ) -> tuple[list[Variable], dict[str, str]]:
-    """Return an FMU's variables, and names that differ from the parameter's.
+    """Return an FMU's variables, and names that differ from those of parameters and quantities.
 
     Parameters
     ----------
@@ -82,7 +85,23 @@ def list_variables(
             renamed[variable.name] = f"parameter.{variable.name}"
             variables[k] = variable = replace(variable, name=renamed[variable.name])
         variables[k] = replace(variable, derivative_of=derivative_of.get(k))
+    used = {x.name for x in variables}
+    for k, variable in enumerate(variables):
+        name = base = to_xml_name(variable.name)
+        count = 1
+        while name != variable.name and name in used:
+            count += 1
+            name = f"{base}_{count}"
+        if name != variable.name:
+            used.add(name)
+            renamed[repr(variable.name)] = name
+            variables[k] = replace(variable, name=name)
     return [x for x in variables if x.name != "epsilon" or epsilon is not None], renamed
+
+
+def to_xml_name(name: str) -> str:
+    """Return a name with the characters that XML cannot have replaced by underscores."""
+    return NOT_IN_XML.sub("_", name)
 
 
 def list_stops(mechanism: Mechanism) -> list[tuple[int, int, float]]:

@@ -24,7 +24,7 @@ from ckc_pin.formats.c.names import initializer
 from ckc_pin.formats.c.writer import TEMPLATES as C_TEMPLATES
 from ckc_pin.formats.c.writer import fill_templates, make_prefix, require_exportable
 from ckc_pin.formats.fmu.model_description import build_description, describe_model
-from ckc_pin.formats.fmu.variables import list_stops, list_variables
+from ckc_pin.formats.fmu.variables import list_stops, list_variables, to_xml_name
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import load_scene_mechanism
@@ -73,12 +73,14 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     experiment = {"stopTime": repr(spec.t_end), "tolerance": repr(spec.solver.rtol)}
     tool = f"ckc_pin {version('ckc_pin')}"
     entries: dict[str, str | bytes] = {
-        "modelDescription.xml": describe_model(fmi, scene.name, prefix, identity, tool, variables, experiment, source),
+        "modelDescription.xml": describe_model(
+            fmi, to_xml_name(scene.name), prefix, identity, tool, variables, experiment, source
+        ),
         **{f"sources/{name}": content for name, content in sources.items()},
     }
     if fmi != "2.0":
         entries["sources/buildDescription.xml"] = build_description(prefix, source)
-    notes = [f"the parameter {old} is called {new}" for old, new in renamed.items()]
+    notes = [f"the variable {old} is called {new}" for old, new in renamed.items()]
     notes += _describe_differences(scene)
     library = _compile(scene.name, sources, source)
     if library is None:

@@ -239,6 +239,7 @@ static mech_status choose_holding(fmu *x, const int *is_resting, const int *pull
 
 /* Update velocities and contacts at an event: an impact, a joint that leaves its stop, or a change of inputs. */
 static mech_status update_stops(fmu *x) {
+  const double at_stop = x->is_model_exchange ? STOP_TOLERANCE : EVENT_OFFSET;
   double held[MECH_N], fastest = 0.0;
   int is_near[STOP_SIZE], pulls[STOP_SIZE], is_lost[STOP_SIZE], any = 0, approaches = 0;
   mech_status status = fmu_differentiate(x);
@@ -248,7 +249,7 @@ static mech_status update_stops(fmu *x) {
   for (int i = 0; i < STOPS; ++i) {
     const double size = SCALE[STOPPED[i]], rate = gap_rate(x->values + RATE, i);
     const double slow = RATE_ROUNDING * fastest * size;
-    is_near[i] = x->is_touching[i] || find_gap(&x->at, i) <= STOP_TOLERANCE * size + RATE_ROUNDING * fabs(rate);
+    is_near[i] = x->is_touching[i] || find_gap(&x->at, i) <= at_stop * size + RATE_ROUNDING * fabs(rate);
     pulls[i] = x->is_touching[i] && x->holding[i] < 0.0;
     /* A joint that leaves its stop cannot be beyond it: the importer's solver does not resolve the bounce, which ends. */
     is_lost[i] = x->is_model_exchange && find_margin(x, &x->at, x->holding, i) < 0.0;
