@@ -4,6 +4,15 @@
 
 @TABLES@
 
+/* Places of q and z in v_tree. An FMU changes them. */
+#ifdef MECH_CHARTS
+#define Q_OF(at) (at)->independent
+#define Z_OF(at) (at)->dependent
+#else
+#define Q_OF(at) INDEPENDENT
+#define Z_OF(at) DEPENDENT
+#endif
+
 /* --- terms of the tree and of the loops, as straight-line code --- */
 
 @FUNCTIONS@
@@ -99,7 +108,7 @@ static mech_status evaluate_loops(const mech_model *model, mech_configuration *a
   code_place(at->q_tree, at->trig, model->numbers, at->phi, at->J);
   if (!is_finite(at->phi, MECH_ROWS)) return MECH_NOT_FINITE;
   for (int k = 0; k < MECH_Z; ++k)
-    for (int i = 0; i < MECH_Z; ++i) at->phi_z[i + MECH_Z * k] = at->J[KEPT[i] + MECH_ROWS * DEPENDENT[k]];
+    for (int i = 0; i < MECH_Z; ++i) at->phi_z[i + MECH_Z * k] = at->J[KEPT[i] + MECH_ROWS * Z_OF(at)[k]];
   return factorize(at->phi_z, at->pivot, MECH_Z) ? MECH_OK : MECH_SINGULAR;
 }
 
@@ -112,10 +121,10 @@ static void close_rows(const mech_configuration *at, const double *rows, double 
 static void compute_rho(mech_configuration *at) {
   for (int k = 0; k < MECH_D; ++k) {
     double z[MECH_SIZE(MECH_Z)], *column = at->rho + MECH_N * k;
-    close_rows(at, at->J + MECH_ROWS * INDEPENDENT[k], z);
-    for (int i = 0; i < MECH_D; ++i) column[INDEPENDENT[i]] = 0.0;
-    column[INDEPENDENT[k]] = 1.0;
-    for (int i = 0; i < MECH_Z; ++i) column[DEPENDENT[i]] = z[i];
+    close_rows(at, at->J + MECH_ROWS * Q_OF(at)[k], z);
+    for (int i = 0; i < MECH_D; ++i) column[Q_OF(at)[i]] = 0.0;
+    column[Q_OF(at)[k]] = 1.0;
+    for (int i = 0; i < MECH_Z; ++i) column[Z_OF(at)[i]] = z[i];
   }
 }
 
@@ -164,14 +173,14 @@ static double tolerance(const double *q_tree) {
 mech_status mech_sigma(const mech_model *model, const double *q, mech_configuration *at) {
   double dq[MECH_D], step[MECH_N], previous = HUGE_VAL;
   if (!is_finite(q, MECH_D)) return MECH_NOT_FINITE;
-  for (int k = 0; k < MECH_D; ++k) dq[k] = q[k] - at->q_tree[mech_q_places[k]];
+  for (int k = 0; k < MECH_D; ++k) dq[k] = q[k] - at->q_tree[PLACE[Q_OF(at)[k]]];
   multiply(at->rho, dq, step, MECH_N, MECH_D);
   for (int iteration = 0;; ++iteration) {
     double longest = 0.0, size = 0.0, z[MECH_SIZE(MECH_Z)];
-    for (int k = 0; k < MECH_Z; ++k) longest = fmax(longest, fabs(step[DEPENDENT[k]]) / SCALE[DEPENDENT[k]]);
+    for (int k = 0; k < MECH_Z; ++k) longest = fmax(longest, fabs(step[Z_OF(at)[k]]) / SCALE[Z_OF(at)[k]]);
     if (!(longest <= MECH_MAX_STEP)) return MECH_NOT_CLOSED;
     move(at->q_tree, step);
-    for (int k = 0; k < MECH_D; ++k) at->q_tree[mech_q_places[k]] = q[k];
+    for (int k = 0; k < MECH_D; ++k) at->q_tree[PLACE[Q_OF(at)[k]]] = q[k];
     const mech_status status = evaluate_loops(model, at);
     if (status != MECH_OK) return status;
     for (int i = 0; i < MECH_Z; ++i) size = fmax(size, fabs(at->phi[KEPT[i]]));
@@ -179,8 +188,8 @@ mech_status mech_sigma(const mech_model *model, const double *q, mech_configurat
     if (!(size <= 0.5 * previous) || iteration == MECH_MAX_ITERATIONS) return MECH_NOT_CLOSED;
     previous = size;
     close_rows(at, at->phi, z);
-    for (int k = 0; k < MECH_D; ++k) step[INDEPENDENT[k]] = 0.0;
-    for (int k = 0; k < MECH_Z; ++k) step[DEPENDENT[k]] = z[k];
+    for (int k = 0; k < MECH_D; ++k) step[Q_OF(at)[k]] = 0.0;
+    for (int k = 0; k < MECH_Z; ++k) step[Z_OF(at)[k]] = z[k];
   }
   compute_rho(at);
   return MECH_OK;
@@ -188,7 +197,7 @@ mech_status mech_sigma(const mech_model *model, const double *q, mech_configurat
 
 mech_status mech_move(const mech_model *model, const double *q, mech_configuration *at) {
   double start[MECH_D], waypoint[MECH_D];
-  for (int k = 0; k < MECH_D; ++k) start[k] = at->q_tree[mech_q_places[k]];
+  for (int k = 0; k < MECH_D; ++k) start[k] = at->q_tree[PLACE[Q_OF(at)[k]]];
   for (int piece = 1; piece <= MECH_PIECES; ++piece) {
     const double rest = (double)(MECH_PIECES - piece) / MECH_PIECES;
     for (int k = 0; k < MECH_D; ++k) waypoint[k] = q[k] - rest * (q[k] - start[k]);
@@ -210,7 +219,7 @@ void mech_tree_acceleration(const mech_model *model, const mech_configuration *a
   mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
   close_rows(at, J_dot_v, z);
   multiply(at->rho, q_ddot, acceleration, MECH_N, MECH_D);
-  for (int k = 0; k < MECH_Z; ++k) acceleration[DEPENDENT[k]] += z[k];
+  for (int k = 0; k < MECH_Z; ++k) acceleration[Z_OF(at)[k]] += z[k];
 }
 
 void mech_points(const mech_model *model, const mech_configuration *at, const double *v_tree, double *positions,
@@ -262,7 +271,7 @@ static void inertial_force(const mech_model *model, const mech_configuration *at
   mech_velocity(at, a, acceleration);
   code_bilinear(at->q_tree, at->trig, v_tree, x_tree, model->numbers, velocity_force, J_dot_x);
   close_rows(at, J_dot_x, z);
-  for (int k = 0; k < MECH_Z; ++k) acceleration[DEPENDENT[k]] += z[k];
+  for (int k = 0; k < MECH_Z; ++k) acceleration[Z_OF(at)[k]] += z[k];
   multiply(D_tree, acceleration, force, MECH_N, MECH_N);
   for (int k = 0; k < MECH_N; ++k) force[k] += velocity_force[k];
 }
@@ -293,7 +302,7 @@ static void solve_multipliers(const mech_model *model, const mech_configuration 
   double D_tree[MECH_N * MECH_N], inertial[MECH_N], z[MECH_SIZE(MECH_Z)];
   mech_D_tree(model, at, D_tree);
   multiply(D_tree, acceleration, inertial, MECH_N, MECH_N);
-  for (int k = 0; k < MECH_Z; ++k) z[k] = inertial[DEPENDENT[k]] - force[DEPENDENT[k]];
+  for (int k = 0; k < MECH_Z; ++k) z[k] = inertial[Z_OF(at)[k]] - force[Z_OF(at)[k]];
   solve_transposed(at->phi_z, at->pivot, MECH_Z, z);
   for (int i = 0; i < MECH_ROWS; ++i) multipliers[i] = 0.0;
   for (int k = 0; k < MECH_Z; ++k) multipliers[KEPT[k]] = z[k];
@@ -409,7 +418,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
   for (int stage = 0; stage < 4; ++stage) {
     if (stage > 0) {
       for (int k = 0; k < MECH_D; ++k) {
-        q[k] = motion->at.q_tree[mech_q_places[k]] + part[stage] * step * q_dot[k];
+        q[k] = motion->at.q_tree[PLACE[Q_OF(&motion->at)[k]]] + part[stage] * step * q_dot[k];
         q_dot[k] = motion->q_dot[k] + part[stage] * step * q_ddot[k];
       }
       status = mech_sigma(model, q, &at);
@@ -422,7 +431,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
       dv[k] += weight[stage] * step * q_ddot[k];
     }
   }
-  for (int k = 0; k < MECH_D; ++k) q[k] = motion->at.q_tree[mech_q_places[k]] + dq[k];
+  for (int k = 0; k < MECH_D; ++k) q[k] = motion->at.q_tree[PLACE[Q_OF(&motion->at)[k]]] + dq[k];
   status = mech_sigma(model, q, &at);
   if (status != MECH_OK) return status;
   motion->at = at;

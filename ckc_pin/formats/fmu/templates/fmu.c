@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#define MECH_CHARTS
 #include "mech.c"
 
 enum { STOPS = @STOPS@ };
@@ -34,6 +35,10 @@ enum {
 enum { STATES = IS_SPF ? MECH_N + MECH_D : 2 * MECH_D };
 enum { ASSEMBLY_PIECES = 64, STAGES = @STAGES@ };
 #define MAX_ROOT_STEPS 80
+/* Entries of rho, in rad or sizes of the mechanism: where co-simulation changes the independent coordinates, and after it. */
+#define MAX_RHO 20.0
+#define GOOD_RHO 1.5
+#define MAX_EXCHANGES 100
 #define TIME_ROUNDING 1e-14    /* s, of events in co-simulation */
 #define STOP_TOLERANCE 1e-9 /* rad, or sizes of the mechanism: a joint this close to its stop is at it */
 
@@ -90,6 +95,8 @@ static void fmu_reset(fmu *x, int is_model_exchange) {
     x->values[POSITION + INDEPENDENT[k]] = START[mech_q_places[k]];
     x->values[RATE + INDEPENDENT[k]] = START_RATES[k];
   }
+  memcpy(x->at.independent, INDEPENDENT, sizeof x->at.independent);
+  memcpy(x->at.dependent, DEPENDENT, MECH_Z * sizeof *DEPENDENT);
   x->tolerance = @RTOL@;
   x->step = 1e-3;
   x->is_initializing = 1;
@@ -147,7 +154,7 @@ static void input_force(const fmu *x, double *u_tree) {
 }
 
 static void independent_rates(const fmu *x, double *q_dot) {
-  for (int k = 0; k < MECH_D; ++k) q_dot[k] = x->values[RATE + INDEPENDENT[k]];
+  for (int k = 0; k < MECH_D; ++k) q_dot[k] = x->values[RATE + x->at.independent[k]];
 }
 
 static int integrates_spf(const fmu *x) { return IS_SPF && x->is_model_exchange; }
@@ -163,7 +170,7 @@ static mech_status follow_states(fmu *x) {
     status = mech_configure(&x->model, q_tree, &at);
   } else {
     double q[MECH_D];
-    for (int k = 0; k < MECH_D; ++k) q[k] = x->values[POSITION + INDEPENDENT[k]];
+    for (int k = 0; k < MECH_D; ++k) q[k] = x->values[POSITION + at.independent[k]];
     status = mech_sigma(&x->model, q, &at);
     if (status != MECH_OK) {
       at = x->at;
@@ -233,7 +240,7 @@ static mech_status project_acceleration(const fmu *x, const mech_configuration *
   mech_status status = factorize_inertia(x, at, D_tree, D, pivot);
   if (status != MECH_OK) return status;
   memset(a, 0, MECH_N * sizeof *a);
-  for (int k = 0; k < MECH_Z; ++k) a[DEPENDENT[k]] = z[k];
+  for (int k = 0; k < MECH_Z; ++k) a[at->dependent[k]] = z[k];
   multiply(D_tree, a, rest, MECH_N, MECH_N);
   for (int k = 0; k < MECH_N; ++k) rest[k] = force[k] - rest[k];
   multiply_transposed(at->rho, rest, q_ddot, MECH_N, MECH_D);
@@ -280,7 +287,7 @@ static mech_status fmu_differentiate(fmu *x) {
   if (integrates_spf(x)) {
     double z_dot[MECH_SIZE(MECH_Z)];
     close_rows(&x->at, x->at.phi, z_dot);
-    for (int k = 0; k < MECH_Z; ++k) x->values[RATE + DEPENDENT[k]] += z_dot[k] / x->values[EPSILON];
+    for (int k = 0; k < MECH_Z; ++k) x->values[RATE + x->at.dependent[k]] += z_dot[k] / x->values[EPSILON];
   }
   x->has_derivatives = 1;
   x->has_outputs = 0;
@@ -340,7 +347,7 @@ static void change_rates(const fmu *x, const double *rates, double decay, const 
   for (int k = 0; k < MECH_Z; ++k) row[k] = -row[k] - decay * phi_change[KEPT[k]];
   solve(at->phi_z, at->pivot, MECH_Z, row);
   multiply(at->rho, q_dot_change, changes, MECH_N, MECH_D);
-  for (int k = 0; k < MECH_Z; ++k) changes[DEPENDENT[k]] += row[k];
+  for (int k = 0; k < MECH_Z; ++k) changes[at->dependent[k]] += row[k];
 }
 
 /* The change of a free root's position and rotation vector by a step along its own axes. */
@@ -364,8 +371,8 @@ static mech_status change_outputs(const fmu *x, double *change) {
   double v_tree[MECH_N], v_change[MECH_N], rate_change[MECH_N], residual[MECH_N + MECH_Z], force[MECH_N];
   double kept[MECH_SIZE(MECH_Z)], z[MECH_SIZE(MECH_Z)], phi_change[MECH_SIZE(MECH_ROWS)], holding[STOP_SIZE];
   for (int k = 0; k < MECH_D; ++k) {
-    q_change[k] = change[POSITION + INDEPENDENT[k]];
-    q_dot_change[k] = change[RATE + INDEPENDENT[k]];
+    q_change[k] = change[POSITION + at->independent[k]];
+    q_dot_change[k] = change[RATE + at->independent[k]];
   }
   multiply(at->rho, q_change, step, MECH_N, MECH_D);
   if (integrates_spf(x)) memcpy(step, change + POSITION, sizeof step);
@@ -447,7 +454,7 @@ static const char *fmu_get(fmu *x, const unsigned *references, size_t n, double 
 
 static int is_state(const fmu *x, int reference) {
   for (int k = 0; k < MECH_D; ++k)
-    if (reference == POSITION + INDEPENDENT[k] || reference == RATE + INDEPENDENT[k]) return 1;
+    if (reference == POSITION + x->at.independent[k] || reference == RATE + x->at.independent[k]) return 1;
   return integrates_spf(x) && reference >= POSITION && reference < RATE;
 }
 
@@ -540,28 +547,9 @@ static mech_status reduced_rate(const fmu *x, const double *u_tree, const double
   if (status != MECH_OK) return status;
   for (int k = 0; k < MECH_D; ++k) {
     rate[k] = y[MECH_D + k];
-    rate[MECH_D + k] = a[INDEPENDENT[k]];
+    rate[MECH_D + k] = a[at->independent[k]];
   }
   return MECH_OK;
-}
-
-/* Return the error of a step relative to its tolerance. */
-static double relative_error(const fmu *x, double h, double rate[STAGES + 1][2 * MECH_D], const double *y,
-                             const double *y_new) {
-  double square5 = 0.0, square3 = 0.0;
-  for (int k = 0; k < 2 * MECH_D; ++k) {
-    double error5 = 0.0, error3 = 0.0;
-    const double size = fmax(fabs(y[k]), fabs(y_new[k]));
-    const double scale = x->tolerance * (0.01 * SCALE[INDEPENDENT[k % MECH_D]] + size);
-    for (int i = 0; i <= STAGES; ++i) {
-      error5 += E5[i] * rate[i][k];
-      error3 += E3[i] * rate[i][k];
-    }
-    square5 += error5 * error5 / (scale * scale);
-    square3 += error3 * error3 / (scale * scale);
-  }
-  if (square5 == 0.0 && square3 == 0.0) return 0.0;
-  return h * square5 / sqrt((square5 + 0.01 * square3) * 2.0 * MECH_D);
 }
 
 /* A step of co-simulation: of the motion y from `at` to y_new at `at_new`. */
@@ -570,6 +558,24 @@ typedef struct {
   double holding[STOP_SIZE], holding_new[STOP_SIZE];
   mech_configuration at, at_new;
 } motion;
+
+/* Return the error of a step relative to its tolerance. */
+static double relative_error(const fmu *x, const motion *s, double h) {
+  double square5 = 0.0, square3 = 0.0;
+  for (int k = 0; k < 2 * MECH_D; ++k) {
+    double error5 = 0.0, error3 = 0.0;
+    const double size = fmax(fabs(s->y[k]), fabs(s->y_new[k]));
+    const double scale = x->tolerance * (0.01 * SCALE[s->at.independent[k % MECH_D]] + size);
+    for (int i = 0; i <= STAGES; ++i) {
+      error5 += E5[i] * s->rate[i][k];
+      error3 += E3[i] * s->rate[i][k];
+    }
+    square5 += error5 * error5 / (scale * scale);
+    square3 += error3 * error3 / (scale * scale);
+  }
+  if (square5 == 0.0 && square3 == 0.0) return 0.0;
+  return h * square5 / sqrt((square5 + 0.01 * square3) * 2.0 * MECH_D);
+}
 
 /* Try a step, with rate[0] known. */
 static mech_status try_step(const fmu *x, motion *s, double h) {
@@ -647,8 +653,8 @@ static mech_status limit_step(const fmu *x, motion *s, double *h, int *has_event
 static void store_motion(fmu *x, const motion *s) {
   x->at = s->at;
   for (int k = 0; k < MECH_D; ++k) {
-    x->values[POSITION + INDEPENDENT[k]] = s->y[k];
-    x->values[RATE + INDEPENDENT[k]] = s->y[MECH_D + k];
+    x->values[POSITION + s->at.independent[k]] = s->y[k];
+    x->values[RATE + s->at.independent[k]] = s->y[MECH_D + k];
   }
   x->has_derivatives = 0;
 }
@@ -658,9 +664,49 @@ static mech_status begin_motion(fmu *x, motion *s) {
   const mech_status status = update_stops(x);
   if (status != MECH_OK) return status;
   s->at = x->at;
-  for (int k = 0; k < MECH_D; ++k) s->y[k] = x->values[POSITION + INDEPENDENT[k]];
+  for (int k = 0; k < MECH_D; ++k) s->y[k] = x->values[POSITION + s->at.independent[k]];
   independent_rates(x, s->y + MECH_D);
   return reduced_rate(x, s->u_tree, s->y, &s->at, s->rate[0], s->holding);
+}
+
+static int is_joint(int coordinate) {
+  for (int k = 0; k < JOINTS; ++k)
+    if (JOINT[k][1] == coordinate) return 1;
+  return 0;
+}
+
+/* Where a dependent coordinate moves much faster than the independent ones, phi_z is nearly singular: exchange two of them,
+   until all entries of rho are small. Only joints become independent. */
+static mech_status change_chart(const fmu *x, motion *s) {
+  mech_configuration *const at = &s->at;
+  double v_tree[MECH_N], limit = MAX_RHO;
+  mech_velocity(at, s->y + MECH_D, v_tree);
+  for (int exchange = 0; exchange < MAX_EXCHANGES; ++exchange) {
+    int *entering = NULL, *leaving = NULL;
+    for (int i = 0; i < MECH_Z; ++i)
+      for (int k = 0; k < MECH_D; ++k) {
+        const int z = at->dependent[i], q = at->independent[k];
+        const double size = fabs(at->rho[z + MECH_N * k]) * SCALE[q] / SCALE[z];
+        if (!(size > limit) || !is_joint(z)) continue;
+        limit = size;
+        entering = &at->dependent[i];
+        leaving = &at->independent[k];
+      }
+    if (entering == NULL) break;
+    const int place = *entering;
+    *entering = *leaving;
+    *leaving = place;
+    const mech_status status = evaluate_loops(&x->model, at);
+    if (status != MECH_OK) return status;
+    compute_rho(at);
+    limit = GOOD_RHO;
+  }
+  if (limit >= MAX_RHO) return MECH_OK;
+  for (int k = 0; k < MECH_D; ++k) {
+    s->y[k] = at->q_tree[PLACE[at->independent[k]]];
+    s->y[MECH_D + k] = v_tree[at->independent[k]];
+  }
+  return reduced_rate(x, s->u_tree, s->y, at, s->rate[0], s->holding);
 }
 
 static mech_status advance(fmu *x, double end) {
@@ -676,7 +722,7 @@ static mech_status advance(fmu *x, double end) {
     int has_event = 0;
     double h = fmin(step, end - t);
     status = try_step(x, &s, h);
-    const double error = status == MECH_OK ? relative_error(x, h, s.rate, s.y, s.y_new) : HUGE_VAL;
+    const double error = status == MECH_OK ? relative_error(x, &s, h) : HUGE_VAL;
     double factor = error == 0.0 ? 10.0 : 0.9 * pow(error, -1.0 / 8.0);
     const double next = h * fmin(is_rejected ? 1.0 : 10.0, factor);
     const int is_last = !(h < end - t);
@@ -689,9 +735,11 @@ static mech_status advance(fmu *x, double end) {
       memcpy(s.holding, s.holding_new, sizeof s.holding);
       s.at = s.at_new;
       is_rejected = 0;
-      if (!has_event) continue;
-      store_motion(x, &s);
-      status = begin_motion(x, &s);
+      status = change_chart(x, &s);
+      if (status == MECH_OK && has_event) {
+        store_motion(x, &s);
+        status = begin_motion(x, &s);
+      }
       if (status != MECH_OK) return status;
     } else {
       if (error < 1.0) factor = 0.5;

@@ -190,7 +190,7 @@ static mech_status resolve_stops(fmu *x, const double *held, int *is_near) {
   }
   if (!resolve_impact(&hit)) return (mech_status)DEPENDENT_STOPS;
   push(&x->at, &c, hit.impulse, v_tree);
-  for (int k = 0; k < MECH_D; ++k) x->values[RATE + INDEPENDENT[k]] = v_tree[INDEPENDENT[k]];
+  for (int k = 0; k < MECH_D; ++k) x->values[RATE + x->at.independent[k]] = v_tree[x->at.independent[k]];
   for (int i = 0; i < STOPS; ++i) is_near[i] = 0;
   for (int j = 0; j < c.count; ++j) is_near[c.which[j]] = hit.rate[j] <= 0.0;
   x->has_derivatives = 0;
@@ -218,7 +218,7 @@ static mech_status choose_holding(fmu *x, const int *is_resting, const int *pull
   if (status != MECH_OK) return status;
   push(&x->at, &c, force, v_tree);
   for (int k = 0; k < JOINTS; ++k) x->values[POSITION + JOINT[k][1]] += step[JOINT[k][1]];
-  for (int k = 0; k < MECH_D; ++k) x->values[RATE + INDEPENDENT[k]] = v_tree[INDEPENDENT[k]];
+  for (int k = 0; k < MECH_D; ++k) x->values[RATE + x->at.independent[k]] = v_tree[x->at.independent[k]];
   x->has_derivatives = 0;
   status = fmu_differentiate(x);
   if (status != MECH_OK) return status;
