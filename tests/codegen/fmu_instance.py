@@ -14,7 +14,7 @@ from fmpy.simulation import instantiate_fmu
 
 from ckc_pin.base.arrays import Array
 
-__all__ = ["Instance", "pointer_to"]
+__all__ = ["Instance"]
 
 ALIVE: list[Any] = []  # FMPy calls the logger of the FMU 2.0 that was made last, also after it is gone
 
@@ -80,12 +80,21 @@ class Instance:
         return np.array(getter([self.reference[name] for name in names]))
 
     def set_states(self, states: Array) -> None:
-        self.fmu.setContinuousStates(pointer_to(np.array(states, dtype=float)), len(states))
+        self.fmu.setContinuousStates(_pointer_to(np.array(states, dtype=float)), len(states))
 
     def get_states(self) -> Array:
         states = np.zeros(len(self.states))
-        self.fmu.getContinuousStates(pointer_to(states), len(states))
+        self.fmu.getContinuousStates(_pointer_to(states), len(states))
         return states
+
+    def rates(self, t: float, states: Array) -> Array:
+        """Return the derivatives of the states."""
+        rates = np.zeros(len(states))
+        self.fmu.setTime(t)
+        self.set_states(states)
+        get = self.fmu.getDerivatives if self.is_old else self.fmu.getContinuousStateDerivatives
+        get(_pointer_to(rates), len(rates))
+        return rates
 
     def update_events(self) -> None:
         """Update the discrete states in event mode, and return to continuous time."""
@@ -98,5 +107,5 @@ class Instance:
         return np.transpose([self.fmu.getDirectionalDerivative(*references, x.tolist()) for x in np.eye(len(knowns))])
 
 
-def pointer_to(numbers: Array) -> Any:
+def _pointer_to(numbers: Array) -> Any:
     return numbers.ctypes.data_as(ctypes.POINTER(ctypes.c_double))

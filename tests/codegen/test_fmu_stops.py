@@ -19,7 +19,7 @@ from ckc_pin.formats.exporting import export, write
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.scene.parts import load_scene_mechanism
 from tests.codegen.fmu_instance import Instance
-from tests.codegen.test_export_c import SANITIZERS, run
+from tests.codegen.test_export_c import SANITIZERS, WARNINGS, run
 
 RTOL, SOLVER_TOLERANCE = 1e-11, 1e-10
 EXACT = 1e-9  # relative: co-simulation against `simulate`
@@ -182,9 +182,10 @@ def test_stops_that_jam_a_mechanism_are_an_error(tmp_path: Path) -> None:
     assert message.startswith("joints that only move together touch several stops at once")
 
 
-def test_fmu_has_no_undefined_behaviour(tmp_path: Path) -> None:
+def test_fmu_has_no_warnings_and_no_undefined_behaviour(tmp_path: Path) -> None:
     with ZipFile(export_fmu(five_bar("comes to rest"), tmp_path, "2.0")) as archive:
         archive.extractall(tmp_path)
+    run("gcc", *WARNINGS, "-c", "sources/fmi2.c", "-o", "fmu.o", cwd=tmp_path)
     harness = Path(__file__).parent / "fmu_harness.c"
     run("gcc", *SANITIZERS, "-Isources", harness, "-lm", "-o", "checked", cwd=tmp_path)
     messages = run("./checked", cwd=tmp_path)

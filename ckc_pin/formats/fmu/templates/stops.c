@@ -143,7 +143,7 @@ static double find_margin(const fmu *x, const mech_configuration *at, const doub
 /* Move joints out of the stops that `is_near` selects, as far as the importer's solver has moved them into these. */
 static mech_status push_out(fmu *x, const int *is_near) {
   double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], step[MECH_N] = {0.0}, size = 0.0;
-  double A[STOP_SIZE * STOP_SIZE], scale[STOP_SIZE], b[STOP_SIZE], distance[STOP_SIZE];
+  double A[STOP_SIZE * STOP_SIZE], scale[STOP_SIZE], b[STOP_SIZE] = {0.0}, distance[STOP_SIZE];
   const int none[STOP_SIZE] = {0};
   int pivot[MECH_D];
   contact c;
@@ -200,7 +200,7 @@ static mech_status resolve_stops(fmu *x, const double *held, int *is_near) {
 /* Choose the stops that hold joints, among those on which joints rest, and put these joints exactly there. */
 static mech_status choose_holding(fmu *x, const int *is_resting, const int *pulls) {
   double D_tree[MECH_N * MECH_N], D[MECH_D * MECH_D], v_tree[MECH_N], q_dot[MECH_D], step[MECH_N] = {0.0};
-  double A[STOP_SIZE * STOP_SIZE], scale[STOP_SIZE], b[STOP_SIZE], force[STOP_SIZE], size = 0.0;
+  double A[STOP_SIZE * STOP_SIZE], scale[STOP_SIZE], b[STOP_SIZE] = {0.0}, force[STOP_SIZE], size = 0.0;
   const int none[STOP_SIZE] = {0};
   int pivot[MECH_D];
   contact c;
