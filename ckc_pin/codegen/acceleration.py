@@ -120,11 +120,22 @@ class ConstrainedInertia:
         """
         import casadi as cs
 
-        n, (residual, unknowns) = self._n, self._residual()
-        change = self._terms.configuration.directional_derivative(residual, q) + cs.jtimes(residual, self._terms.v, v)
+        n, (change, unknowns) = self._n, self.residual_change(q, v)
         more = more - cs.substitute(change, unknowns, self._solution(u))
         derivative, _ = self.solve([more[i] for i in range(n)], [more[i] for i in range(n, more.numel())])
         return cs.vertcat(*derivative)
+
+    def residual_change(self, q: Any, v: Any) -> tuple[Any, Any]:
+        """Return the derivative of eq. 1's left side along one direction of q' and v', and the unknowns of eq. 1.
+
+        The left side has n forces and an acceleration for each kept row. The unknowns are dv'/dt and the kept rows'
+        multipliers, whose symbols are in the derivative.
+        """
+        import casadi as cs
+
+        residual, unknowns = self._residual()
+        change = self._terms.configuration.directional_derivative(residual, q) + cs.jtimes(residual, self._terms.v, v)
+        return change, unknowns
 
     def argument_derivative(self, u: Any, arguments: Any) -> Any:
         """Return the changes of u' and J v'_dot that are equivalent to a change of the mechanism's numbers.

@@ -36,6 +36,14 @@ FUNCTIONS = {
 PORTABLE_FUNCTIONS = {
     name: FUNCTIONS[name] for name in ("place", "inertia", "bias", "rest", "potential_energy", "acceleration")
 } | {"bilinear": (("q", "v", "x"), ("bias_x", "J_dot_x")), "points": (("q", "v"), ("positions", "velocities"))}
+# Of exported FMUs: derivatives along a `step` of q' in tangent coordinates and a change of v'. `residual_change` is
+# that of eq. 1 at an acceleration `a` and the kept rows' `multipliers`; `loop_rate_change` of the kept rows of J v'.
+PORTABLE_DERIVATIVES = {
+    "residual_change": (("q", "v", "a", "multipliers", "step", "v_change"), ("residual_change",)),
+    "loop_rate_change": (("q", "v", "step"), ("loop_rate_change",)),
+    "point_changes": (("q", "v", "step", "v_change"), ("position_changes", "velocity_changes")),
+    "energy_changes": (("q", "v", "step", "v_change"), ("kinetic_change", "potential_change")),
+}
 # Limit of (operations of the acceleration) * n, about twice the operations of its derivatives. `jacobian` is left out
 # above it.
 MAX_JACOBIAN_OPERATIONS = 3e4
@@ -96,7 +104,8 @@ class TermFunctions:
         of_members : bool
             Whether to add the acceleration of several members at a time.
         portable : bool
-            Whether to derive `PORTABLE_FUNCTIONS`, for code without vectors of identical branches.
+            Whether to derive `PORTABLE_FUNCTIONS`, for code without vectors of identical branches; with
+            `directional_derivatives` also `PORTABLE_DERIVATIVES`.
 
         Raises
         ------
@@ -110,7 +119,7 @@ class TermFunctions:
             raise InputError(message) from error
         lanes = dict(find_identical_branches(mechanism.tree))
         terms = term_expressions(mechanism, which, () if portable else group_roots(mechanism.tree, lanes))
-        table = PORTABLE_FUNCTIONS if portable else FUNCTIONS
+        table = PORTABLE_FUNCTIONS | PORTABLE_DERIVATIVES if portable else FUNCTIONS
         symbols = {
             "q": terms.configuration.q,
             "trig": terms.configuration.trig,
@@ -119,6 +128,8 @@ class TermFunctions:
             "correction": cs.SX.sym("correction", mechanism.closure.rows),
             "residual": cs.SX.sym("residual", mechanism.closure.rows),
             "x": cs.SX.sym("x", mechanism.n),
+            "a": cs.SX.sym("a", mechanism.n),
+            "multipliers": cs.SX.sym("multipliers", len(terms.kept)),
         }
         direction = {
             "step": cs.SX.sym("step", mechanism.n),
@@ -126,6 +137,7 @@ class TermFunctions:
             "more": cs.SX.sym("more", mechanism.n + len(terms.kept)),
             "varied": cs.SX.sym("varied", terms.arguments.vector.numel()),
         }
+        symbols |= {"step": direction["step"], "v_change": direction["v"]}
         results = _results(terms, symbols, direction if directional_derivatives else None, portable)
         column, numbers, functions, lanes["numbers"] = _extract_numbers(mechanism, terms, results, lanes)
         parts = dict(zip(results, split_column(column, [x.numel() for x in results.values()]), strict=True))
@@ -136,7 +148,7 @@ class TermFunctions:
             outputs_column = cs.cse(cs.vertcat(*(parts[x] for x in outputs)))
             values = split_column(outputs_column, [results[x].numel() for x in outputs])
             functions[name] = cs.Function(name, [*inputs.values()], values, [*inputs], list(outputs))
-        if directional_derivatives:
+        if directional_derivatives and not portable:
             state = {name: symbols[name] for name in ("q", "trig", "v", "u")} | {"numbers": numbers}
             groups = terms.arguments.groups
             derivatives, new_lanes = derivative_functions(parts, state, direction, groups, lanes)
@@ -200,6 +212,8 @@ def _results(
         bilinear = cs.jtimes(velocity_terms, terms.v, symbols["x"]) / 2
         results["positions"], results["velocities"] = terms.points
         results["bias_x"], results["J_dot_x"] = split_column(bilinear, [terms.v.numel(), rows.phi.numel()])
+        if direction is not None:
+            results |= _portable_derivatives(terms, inertia, symbols)
         return {name: cs.densify(x) for name, x in results.items()}
     J_dot = terms.configuration.directional_derivative(cs.vec(rows.J), terms.q_dot)
     results["J_dot"] = cs.reshape(J_dot, rows.J.shape)
@@ -217,3 +231,26 @@ def _results(
     results["change"] = inertia.directional_derivative(symbols["u"], q_change, v, more)
     results["by_arguments"] = inertia.argument_derivative(symbols["u"], parameter_direction)
     return {name: cs.densify(x) for name, x in results.items()}
+
+
+def _portable_derivatives(
+    terms: TermExpressions, inertia: ConstrainedInertia, symbols: dict[str, Any]
+) -> dict[str, Any]:
+    import casadi as cs
+
+    v_change = symbols["v_change"]
+    q_change = cs.substitute(terms.q_dot, terms.v, symbols["step"])
+
+    def derivative(x: Any) -> Any:
+        return terms.configuration.directional_derivative(x, q_change) + cs.jtimes(x, terms.v, v_change)
+
+    change, unknowns = inertia.residual_change(q_change, v_change)
+    loop_rate = cs.mtimes(terms.rows.J[list(terms.kept), :], terms.v)
+    return {
+        "residual_change": cs.substitute(change, unknowns, cs.vertcat(symbols["a"], symbols["multipliers"])),
+        "loop_rate_change": terms.configuration.directional_derivative(loop_rate, q_change),
+        "position_changes": derivative(terms.points[0]),
+        "velocity_changes": derivative(terms.points[1]),
+        "kinetic_change": derivative(terms.kinetic),
+        "potential_change": derivative(terms.potential),
+    }

@@ -352,6 +352,17 @@ def identification(
     raise typer.Exit(identification_trials.main(names, method, trials))
 
 
+@app.command(epilog=examples("importers build/fmusim"))
+def importers(fmusim: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
+    """Run exported FMUs in fmusim and compare them with runs.
+
+    Prints the table of docs/guide/simulators.md.
+    """
+    from scripts.experiments import importers
+
+    raise typer.Exit(importers.main(fmusim))
+
+
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """Make the pictures of docs/images with a browser."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 import ckc_pin
+from ckc_pin.formats.exporting import export, write
 from ckc_pin.view.gif import quantize_frames
 from ckc_pin.view.style import COLOURS, GREY, figure_style
 from scripts.experiments.chart import shrink
@@ -122,6 +124,42 @@ def pipeline() -> Any:
 
 
 @figure_style()
+def fmu() -> Any:
+    """Draw the motion of an FMU in FMPy beside the run, a five-bar whose driven links bounce off their stops."""
+    import fmpy
+    from matplotlib.figure import Figure
+
+    parameters = {"gravity": [-9.81, -3.0, 0.0]} | {f"joint.theta_{k}.friction": 0.0 for k in (1, 2, 3, 4)}
+    keys = {"formulation": "reduced", "controller": None, "t_end": 0.6, "parameters": parameters}
+    scene = ckc_pin.load_scene("five_bar/friction", {**keys, "solver": {"rtol": 1e-11, "output_dt": 5e-3}})
+    run, names = ckc_pin.simulate(scene), ("theta_1", "theta_3")
+    with TemporaryDirectory() as folder:
+        (path,) = write(export(scene, "fmu"), Path(folder))
+        results = {
+            kind: fmpy.simulate_fmu(
+                str(path), fmi_type=kind, stop_time=0.6, output_interval=5e-3, relative_tolerance=rtol, output=names,
+                record_events=False,
+            )
+            for kind, rtol in (("CoSimulation", 1e-11), ("ModelExchange", 1e-9))
+        }  # fmt: skip
+    figure = Figure(figsize=(8.0, 3.4), dpi=100, layout="constrained")
+    motion, differences = figure.subplots(1, 2)
+    for name, symbol, colour, stop in zip(names, ("θ₁", "θ₃"), (BLUE, ORANGE), (-1.45, -2.0), strict=True):
+        motion.plot(run.t, run[name], color=colour, label=f"{symbol}, simulate")
+        shown = results["CoSimulation"][::4]
+        motion.plot(shown["time"], shown[name], "o", color=colour, mfc="none", ms=5, label=f"{symbol}, FMPy")
+        motion.axhline(stop, color=GREY, lw=0.9, ls=":")
+    motion.set(xlabel="t (s)", ylabel="angle (rad)", title="Two links fall on their stops")
+    motion.legend()
+    for (kind, result), colour in zip(results.items(), (BLUE, ORANGE), strict=True):
+        difference = np.max([np.abs(result[name] - run[name]) for name in names], axis=0)
+        differences.semilogy(run.t, np.maximum(difference, 1e-16), color=colour, label=kind)
+    differences.set(xlabel="t (s)", ylabel="rad", title="Difference from simulate")
+    differences.legend()
+    return figure
+
+
+@figure_style()
 def moving(path: Path, count: int = 60) -> None:
     """Write an animation of the five-bar under tracking control."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -168,7 +206,8 @@ def moving(path: Path, count: int = 60) -> None:
 
 def main() -> None:
     """Draw all figures."""
-    for draw, place in ((rows, "guide/rows.png"), (frames, "guide/frames.png"), (pipeline, "theory/pipeline.png")):
+    places = {rows: "guide/rows.png", frames: "guide/frames.png", pipeline: "theory/pipeline.png", fmu: "guide/fmu.png"}
+    for draw, place in places.items():
         (IMAGES / place).parent.mkdir(parents=True, exist_ok=True)
         draw().savefig(IMAGES / place)
         shrink(IMAGES / place)

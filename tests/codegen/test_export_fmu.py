@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 from zipfile import ZipFile
 
@@ -19,11 +17,11 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, Mechanism, Run, Scene, Simulator, load, load_scene, simulate
-from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.arguments import argument_names, present, values
 from ckc_pin.formats.exporting import export, write
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.scene.parts import load_scene_mechanism
+from tests.codegen.fmu_instance import Instance
 from tests.codegen.test_export_c import WARNINGS, make_mechanism, run
 from tests.contract.helpers.command import ckc
 
@@ -60,9 +58,8 @@ def fmu_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pat
 
 def simulate_fmu(path: Path, kind: str, outputs: list[str], **options: Any) -> Any:
     tolerance = {"relative_tolerance": RTOL} if kind == "CoSimulation" else {"relative_tolerance": SOLVER_TOLERANCE}
-    return fmpy.simulate_fmu(
-        str(path), fmi_type=kind, stop_time=T_END, output_interval=OUTPUT_DT, output=outputs, **{**tolerance, **options}
-    )
+    times = {"stop_time": T_END, "output_interval": OUTPUT_DT}
+    return fmpy.simulate_fmu(str(path), fmi_type=kind, output=outputs, **{**times, **tolerance, **options})
 
 
 def kinds_of_outputs(mechanism: Mechanism) -> dict[str, list[str]]:
@@ -107,32 +104,27 @@ def test_fmu_moves_as_the_run_does(name: str, fmi: str, kind: str, fmu_of: Calla
     assert theirs["phi.max"].max() <= (10 * SOLVER_TOLERANCE if is_spf else 1e-12)
 
 
+@pytest.mark.parametrize(("name", "t_end"), [("andrews", 0.03), ("stewart", 0.5), ("three_rrr", 5.0)])
+def test_larger_fmus_move_as_the_runs_do(name: str, t_end: float, tmp_path: Path) -> None:
+    """The run of three_rrr changes its independent coordinates, and the FMU does so too."""
+    keys = {"t_end": t_end, "solver.rtol": RTOL, "solver.output_dt": t_end / 50, "formulation": "reduced"}
+    scene = load_scene(name, keys | {"controller": None})
+    (path,) = write(export(scene, "fmu", fmi="3.0"), tmp_path)
+    mechanism, ours = load_scene_mechanism(scene), simulate(scene)
+    outputs = [name for names in kinds_of_outputs(mechanism).values() for name in names]
+    theirs = simulate_fmu(path, "CoSimulation", outputs, stop_time=t_end, output_interval=t_end / 50)
+    assert largest_difference(mechanism, ours, theirs) <= EXACT
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_derivatives_of_model_exchange_are_those_of_the_run(name: str, fmu_of: Callable[[str, str], Path]) -> None:
     """SciPy integrates the FMU's derivatives more accurately than CVode does."""
-    fmu, scene = instantiate(fmu_of(name, "2.0"), kind="ModelExchange"), scene_of(name)
-    fmu.enterContinuousTimeMode()
-    structure = fmu.description.derivatives
-    start = np.zeros(len(structure))
-    fmu.getContinuousStates(pointer_to(start), len(start))
-
-    def differentiate(t: float, states: Array) -> Array:
-        x, rates = np.array(states), np.zeros(len(states))
-        fmu.setTime(t)
-        fmu.setContinuousStates(pointer_to(x), len(x))
-        fmu.getDerivatives(pointer_to(rates), len(x))
-        return rates
-
+    fmu, scene = Instance(fmu_of(name, "2.0"), "ModelExchange"), scene_of(name)
     ours = simulate(scene)
-    solution = solve_ivp(differentiate, (0.0, T_END), start, "DOP853", t_eval=ours.t, rtol=1e-12, atol=1e-13)
-    for state, actual in zip([x.variable.derivative.name for x in structure], solution.y, strict=True):
+    solution = solve_ivp(fmu.rates, (0.0, T_END), fmu.get_states(), "DOP853", t_eval=ours.t, rtol=1e-12, atol=1e-13)
+    for state, actual in zip(fmu.states, solution.y, strict=True):
         expected = ours[state]
         assert np.abs(actual - expected).max() <= EXACT * max(1.0, np.abs(expected).max())
-    fmu.freeInstance()
-
-
-def pointer_to(numbers: Array) -> Any:
-    return numbers.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
 
 
 def test_motor_torques_are_inputs(fmu_of: Callable[[str, str], Path]) -> None:
@@ -141,40 +133,13 @@ def test_motor_torques_are_inputs(fmu_of: Callable[[str, str], Path]) -> None:
     t = OUTPUT_DT * np.arange(count)
     tau = np.array([0.5 * np.sin(3 * t), -0.3 * np.cos(5 * t)])
     states = [simulator.step(tau=tau[:, k], dt=OUTPUT_DT) for k in range(count)]
-    fmu = instantiate(fmu_of("five_bar", "2.0"))
-    reference = {x.name: x.valueReference for x in fmu.description.modelVariables}
-    places = [reference["tau.theta_1"], reference["tau.theta_3"]]
+    fmu = Instance(fmu_of("five_bar", "2.0"), "CoSimulation")
     for k in range(count):
-        fmu.setReal(places, tau[:, k].tolist())
-        fmu.doStep(OUTPUT_DT * k, OUTPUT_DT)
-        actual = fmu.getReal([reference[name] for name in ("theta_1", "theta_2", "v.theta_1", "v.theta_3")])
+        fmu.set({"tau.theta_1": float(tau[0, k]), "tau.theta_3": float(tau[1, k])})
+        fmu.fmu.doStep(OUTPUT_DT * k, OUTPUT_DT)
+        actual = fmu.get(["theta_1", "theta_2", "v.theta_1", "v.theta_3"])
         expected = [*states[k].q_tree[:2], *states[k].q_dot]
         np.testing.assert_allclose(actual, expected, rtol=0, atol=EXACT * 5)
-    fmu.terminate()
-    fmu.freeInstance()
-
-
-def instantiate(
-    path: Path, values: dict[str, float] | None = None, guid: str | None = None, kind: str = "CoSimulation"
-) -> Any:
-    """Return an FMU 2.0 after its initialization, with start values."""
-    folder = fmpy.extract(str(path), mkdtemp(dir=path.parent))  # a library must not be overwritten while it is loaded
-    description = fmpy.read_model_description(folder)
-    fmu = (fmpy.fmi2.FMU2Slave if kind == "CoSimulation" else fmpy.fmi2.FMU2Model)(
-        guid=guid or description.guid,
-        unzipDirectory=folder,
-        modelIdentifier=description.coSimulation.modelIdentifier,
-        instanceName="test",
-    )
-    fmu.description = description
-    fmu.instantiate()
-    fmu.setupExperiment(tolerance=RTOL, startTime=0.0)
-    fmu.enterInitializationMode()
-    reference = {x.name: x.valueReference for x in description.modelVariables}
-    for name, value in (values or {}).items():
-        fmu.setReal([reference[name]], [value])
-    fmu.exitInitializationMode()
-    return fmu
 
 
 @pytest.mark.parametrize("fmi", FMI)
@@ -202,30 +167,67 @@ def link_numbers(scene: Scene) -> dict[str, float]:
 
 
 def test_state_can_be_saved_and_restored(fmu_of: Callable[[str, str], Path]) -> None:
-    fmu = instantiate(fmu_of("five_bar", "2.0"))
-    everything = [x.valueReference for x in fmu.description.modelVariables]
+    instance = Instance(fmu_of("five_bar", "2.0"), "CoSimulation")
+    fmu, everything = instance.fmu, list(instance.reference)
     fmu.doStep(0.0, 0.1)
     saved = fmu.getFMUstate()
     content = fmu.serializeFMUstate(saved)
     fmu.doStep(0.1, 0.3)
-    expected = fmu.getReal(everything)
+    expected = instance.get(everything)
     for state in (saved, fmu.deSerializeFMUstate(content)):
         fmu.setFMUstate(state)
         fmu.doStep(0.1, 0.3)
-        assert fmu.getReal(everything) == expected
+        np.testing.assert_array_equal(instance.get(everything), expected)
         fmu.freeFMUstate(state)
     fmu.reset()
     fmu.freeInstance()
 
 
-def test_start_that_cannot_be_assembled_is_an_error(fmu_of: Callable[[str, str], Path]) -> None:
-    with pytest.raises(FMICallException, match="fmi2ExitInitializationMode failed"):
-        instantiate(fmu_of("five_bar", "2.0"), {"theta_1": -3.0, "theta_3": 0.0})
+BAD_VALUES = {
+    "start out of reach": ("five_bar", {"theta_1": -3.0, "theta_3": 0.0}, "the loops cannot be closed: coordinates or"),
+    "link too long": (
+        "five_bar",
+        {"joint.theta_2.xyz.x": 5.0},
+        "the loops cannot be closed: coordinates or parameters",
+    ),
+    "NaN": ("five_bar", {"joint.theta_2.xyz.x": float("nan")}, "a value is not a finite number"),
+    "infinite": ("delta", {"gravity.z": float("inf")}, "a value is not a finite number"),
+    "epsilon": ("five_bar_spf", {"epsilon": 0.0}, "epsilon must be positive"),
+    "dependent": ("five_bar", {"theta_2": 0.1}, "only inputs, parameters and start values can be set"),
+}
 
 
-def test_other_model_descriptions_are_refused(fmu_of: Callable[[str, str], Path]) -> None:
-    with pytest.raises(Exception, match="instantiate"):
-        instantiate(fmu_of("five_bar", "2.0"), guid="{0}")
+@pytest.mark.parametrize("fmi", FMI)
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_bad_values_are_errors_with_a_message(case: str, fmi: str, fmu_of: Callable[[str, str], Path]) -> None:
+    name, values, expected = BAD_VALUES[case]
+    messages: list[str] = []
+    with pytest.raises(FMICallException):
+        Instance(fmu_of(name, fmi), "ModelExchange", values, messages=messages)
+    assert len(messages) == 1
+    assert messages[0].startswith(expected)
+
+
+@pytest.mark.parametrize("fmi", FMI)
+def test_singular_phi_z_is_an_error_in_model_exchange(fmi: str, tmp_path: Path) -> None:
+    """Its states are the coordinates that the model description names. Co-simulation changes them on the way."""
+    scene = load_scene("three_rrr", {"formulation": "reduced"})
+    (path,) = write(export(scene, "fmu", fmi=fmi), tmp_path)
+    fmu = Instance(path, "ModelExchange")
+    with pytest.raises(FMICallException, match=r"Derivatives failed with status 2 .discard"):
+        solve_ivp(fmu.rates, (0.0, 1.0), fmu.get_states(), "DOP853", rtol=1e-9, atol=1e-9)
+    (message,) = fmu.messages
+    assert re.match(
+        "phi_z is singular: the independent coordinates do not determine|the loops cannot be closed", message
+    )
+
+
+@pytest.mark.parametrize(("fmi", "word"), [("2.0", "GUID"), ("3.0", "instantiation token")])
+def test_other_model_descriptions_are_refused(fmi: str, word: str, fmu_of: Callable[[str, str], Path]) -> None:
+    messages: list[str] = []
+    with pytest.raises(Exception, match=r"instantiate|Instantiate"):
+        Instance(fmu_of("five_bar", fmi), "CoSimulation", messages=messages, guid="{0}")
+    assert messages == [f"the {word} is not that of the model description"]
 
 
 @pytest.mark.parametrize("fmi", FMI)
@@ -265,6 +267,19 @@ def test_names_that_are_no_identifiers_are_kept_in_flat_names(tmp_path: Path) ->
     assert "v.théta-1 (links)" in [x.name for x in fmpy.read_model_description(str(path)).modelVariables]
 
 
+@pytest.mark.parametrize("fmi", FMI)
+def test_characters_that_xml_cannot_have_are_replaced_and_listed(fmi: str, tmp_path: Path) -> None:
+    make_mechanism(tmp_path)
+    file = tmp_path / "mechanism.toml"
+    more = '\n[[point]]\nname = "t_p"\nframe = "tip_left"\n'
+    file.write_text(file.read_text().replace('name = "tip"', r'name = "t\u0001p"') + more)
+    exported = export(Scene(tmp_path, t_end=1.0), "fmu", fmi=fmi)
+    (path,) = write(exported, tmp_path / "fmu")
+    assert validate_fmu(str(path)) == []
+    assert {"t_p.x", "t_p.x_2"} <= {x.name for x in fmpy.read_model_description(str(path)).modelVariables}
+    assert r"the variable 't\x01p.x' is called t_p.x_2" in exported.differences
+
+
 def test_without_a_compiler_the_fmu_has_sources_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     exported = export(scene_of("five_bar"), "fmu")
@@ -277,7 +292,7 @@ def test_without_a_compiler_the_fmu_has_sources_only(tmp_path: Path, monkeypatch
 REFUSED = {
     "controller": ("five_bar", {}, "a controller is not exported.*--unset controller"),
     "sampled": ("five_bar", {"controller.sample_time": 0.01}, "a sampled controller is not exported"),
-    "stops": ("five_bar/friction", {"controller": None}, "stops of theta_1, theta_3 are not supported"),
+    "friction": ("five_bar/friction", {"controller": None}, "dry friction of theta_1, .* is not supported"),
     "forces": (
         "five_bar/swing",
         {"force": [{"frame": "link_2", "force": [1.0, 0.0, 0.0]}]},

@@ -58,7 +58,11 @@ def to_c(mechanism: Mechanism, stem: str) -> tuple[dict[str, str], list[str]]:
 
 
 def fill_templates(
-    mechanism: Mechanism, prefix: str, texts: Mapping[str, str], more: Mapping[str, str] | None = None
+    mechanism: Mechanism,
+    prefix: str,
+    texts: Mapping[str, str],
+    more: Mapping[str, str] | None = None,
+    derivatives: bool = False,
 ) -> dict[str, str]:
     """Return templates by file name with a mechanism's code, sizes and names.
 
@@ -70,8 +74,10 @@ def fill_templates(
     texts : mapping
     more : mapping, optional
         Further texts, which replace ``@KEY@``.
+    derivatives : bool
+        Whether the code has directional derivatives of the terms.
     """
-    functions = TermFunctions.of(mechanism, portable=True).functions
+    functions = TermFunctions.of(mechanism, portable=True, directional_derivatives=derivatives).functions
     enumerators = _enumerators(mechanism, prefix)
     substitutions = {
         **_sizes(mechanism, functions),
@@ -186,7 +192,8 @@ def _tables(mechanism: Mechanism) -> str:
             table("int", "JOINT", joints, 2),
             table("int", "ROOT", [(int(a), int(b)) for a, b in tree.free_roots], 2),
             table("int", "ANGLE", angles),
-            "/* Places in v_tree of q and z; rows that are not redundant. */",
+            "/* Places of the coordinates of v_tree in q_tree; of q and z in v_tree; rows that are not redundant. */",
+            table("int", "PLACE", tree.q_index.tolist()),
             table("int", "INDEPENDENT", partition.q.tolist()),
             table("int", "DEPENDENT", partition.z.tolist()),
             table("int", "KEPT", mechanism.independent_rows),

@@ -16,7 +16,10 @@ BASE_UNITS = {"N": {"kg": 1, "m": 1, "s": -2}, "J": {"kg": 1, "m": 2, "s": -2}}
 EXPONENTS = {"²": 2}
 IDENTIFIER = r"[A-Za-z_][A-Za-z0-9_]*"
 STRUCTURED_NAME = re.compile(rf"{IDENTIFIER}(\.{IDENTIFIER})*")
-FLAGS = {"2.0": "canGetAndSetFMUstate canSerializeFMUstate", "3.0": "canGetAndSetFMUState canSerializeFMUState"}
+FLAGS = {
+    "2.0": "canGetAndSetFMUstate canSerializeFMUstate providesDirectionalDerivative",
+    "3.0": "canGetAndSetFMUState canSerializeFMUState providesDirectionalDerivatives",
+}
 
 
 def describe_model(
@@ -61,7 +64,7 @@ def describe_model(
         },
     )
     if is_old:
-        root.set("numberOfEventIndicators", "0")
+        root.set("numberOfEventIndicators", str(sum(x.is_event_indicator for x in variables)))
     for kind in ("ModelExchange", "CoSimulation"):
         interface = SubElement(root, kind, {"modelIdentifier": identifier})
         for flag in FLAGS[fmi].split():
@@ -159,6 +162,9 @@ def _add_structure(root: Element, variables: Sequence[Variable], is_old: bool) -
                 SubElement(parent, "Unknown", {"index": index[variable.reference]})
             else:
                 SubElement(parent, new, {"valueReference": str(variable.reference)})
+    for variable in variables:
+        if variable.is_event_indicator and not is_old:
+            SubElement(structure, "EventIndicator", {"valueReference": str(variable.reference)})
 
 
 def _indices(variables: Sequence[Variable]) -> dict[int, str]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.arguments import argument_names, argument_units, present, values
@@ -11,9 +14,12 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.mechanism.units import effort, joined, motor_units, row_units
 
-__all__ = ["Variable", "list_variables"]
+__all__ = ["Variable", "list_stops", "list_variables", "to_xml_name"]
 
 AXES = ("x", "y", "z")
+# Characters that XML, or a normalized string of XML, cannot have.
+NOT_IN_XML = re.compile("[^\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+STOP = "distance from the stop, or its force while the joint rests on it: an event indicator"
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,7 @@ class Variable:
     description : str
     derivative_of : int or None
         Value reference of the state whose derivative it is.
+    is_event_indicator : bool
     """
 
     name: str
@@ -46,12 +53,13 @@ class Variable:
     unit: str = ""
     description: str = ""
     derivative_of: int | None = None
+    is_event_indicator: bool = False
 
 
 def list_variables(
     mechanism: Mechanism, q_tree: Array, q_dot: Array, epsilon: float | None
 ) -> tuple[list[Variable], dict[str, str]]:
-    """Return an FMU's variables, and names that differ from the parameter's.
+    """Return an FMU's variables, and names that differ from those of parameters and quantities.
 
     Parameters
     ----------
@@ -77,7 +85,34 @@ def list_variables(
             renamed[variable.name] = f"parameter.{variable.name}"
             variables[k] = variable = replace(variable, name=renamed[variable.name])
         variables[k] = replace(variable, derivative_of=derivative_of.get(k))
+    used = {x.name for x in variables}
+    for k, variable in enumerate(variables):
+        name = base = to_xml_name(variable.name)
+        count = 1
+        while name != variable.name and name in used:
+            count += 1
+            name = f"{base}_{count}"
+        if name != variable.name:
+            used.add(name)
+            renamed[repr(variable.name)] = name
+            variables[k] = replace(variable, name=name)
     return [x for x in variables if x.name != "epsilon" or epsilon is not None], renamed
+
+
+def to_xml_name(name: str) -> str:
+    """Return a name with the characters that XML cannot have replaced by underscores."""
+    return NOT_IN_XML.sub("_", name)
+
+
+def list_stops(mechanism: Mechanism) -> list[tuple[int, int, float]]:
+    """Return the coordinate, the side, 1 for the upper one or -1, and the position of each stop of a mechanism."""
+    bounds = zip(mechanism.joints.lower, mechanism.joints.upper, strict=True)
+    return [
+        (k, side, float(x))
+        for k, both in enumerate(bounds)
+        for side, x in zip((-1, 1), both, strict=True)
+        if np.isfinite(x)
+    ]
 
 
 def _by_name(variables: Sequence[Variable]) -> dict[str, list[Variable]]:
@@ -123,6 +158,9 @@ def _iterate_variables(mechanism: Mechanism, q_tree: Array, q_dot: Array, epsilo
         yield _output(f"energy.{name}", "J", "energy")
     row_unit = joined(row_units(mechanism))
     yield _output("phi.max", row_unit if " or " not in row_unit else "", "largest residual of the loops")
+    for k, side, _ in list_stops(mechanism):
+        indicator = _output(f"stop.{coordinates[k]}.{'lower' if side < 0 else 'upper'}", "", STOP)
+        yield replace(indicator, is_event_indicator=True)
 
 
 def _output(name: str, unit: str, description: str, start: float | None = None) -> Variable:

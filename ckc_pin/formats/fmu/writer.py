@@ -18,12 +18,13 @@ from scipy.integrate import DOP853
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.atomic_files import temporary_folder
 from ckc_pin.codegen.compiler import EXACT, FLAGS, compile_c, find_compiler
+from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.formats.c.names import initializer
 from ckc_pin.formats.c.writer import TEMPLATES as C_TEMPLATES
 from ckc_pin.formats.c.writer import fill_templates, make_prefix, require_exportable
 from ckc_pin.formats.fmu.model_description import build_description, describe_model
-from ckc_pin.formats.fmu.variables import list_variables
+from ckc_pin.formats.fmu.variables import list_stops, list_variables, to_xml_name
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start, find_start
 from ckc_pin.scene.parts import load_scene_mechanism
@@ -35,6 +36,7 @@ FMI_VERSIONS = ("2.0", "3.0")
 TEMPLATES = Path(__file__).parent / "templates"
 SYSTEMS = {"Linux": ("linux", ".so"), "Darwin": ("darwin", ".dylib")}
 MACHINES = {"AMD64": "x86_64", "arm64": "aarch64"}
+ZERO_ACCELERATION = 1e-10  # rad/s^2, or sizes of the mechanism per s^2: smaller forces of stops count as zero
 EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # a fixed date, so that the same scene gives the same file
 
 
@@ -71,12 +73,14 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     experiment = {"stopTime": repr(spec.t_end), "tolerance": repr(spec.solver.rtol)}
     tool = f"ckc_pin {version('ckc_pin')}"
     entries: dict[str, str | bytes] = {
-        "modelDescription.xml": describe_model(fmi, scene.name, prefix, identity, tool, variables, experiment, source),
+        "modelDescription.xml": describe_model(
+            fmi, to_xml_name(scene.name), prefix, identity, tool, variables, experiment, source
+        ),
         **{f"sources/{name}": content for name, content in sources.items()},
     }
     if fmi != "2.0":
         entries["sources/buildDescription.xml"] = build_description(prefix, source)
-    notes = [f"the parameter {old} is called {new}" for old, new in renamed.items()]
+    notes = [f"the variable {old} is called {new}" for old, new in renamed.items()]
     notes += _describe_differences(scene)
     library = _compile(scene.name, sources, source)
     if library is None:
@@ -104,11 +108,6 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
         raise InputError(
             f"{where}: forces on links ({names}) are not supported; remove them, and use the inputs force.COORDINATE"
         )
-    stopped = [mechanism.coordinates[k] for k in np.flatnonzero(mechanism.joints.stopped)]
-    if stopped:
-        raise InputError(
-            f"{where}: stops of {', '.join(stopped)} are not supported, since impacts need events; set stops = false"
-        )
     if spec.initial.w is not None and np.any(spec.initial.w):
         raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it")
     if spec.formulation == "spf" and mechanism.tree.free_roots:
@@ -132,21 +131,31 @@ def _describe_differences(scene: Scene) -> list[str]:
 def _write_sources(
     mechanism: Mechanism, prefix: str, source: str, start: Start, epsilon: float | None, rtol: float
 ) -> dict[str, str]:
-    names = {C_TEMPLATES: ("mech.c", "mech.h"), TEMPLATES: ("fmu.c", source)}
+    names = {C_TEMPLATES: ("mech.c", "mech.h"), TEMPLATES: ("fmu.c", "stops.c", source)}
     texts = {name: (folder / name).read_text(encoding="ascii") for folder, members in names.items() for name in members}
+    stops, tree = list_stops(mechanism), mechanism.tree
+    inertia = np.diag(Terms(mechanism, start.at, np.zeros(mechanism.n)).D_tree) * tree.step_scale
     more = {
+        "STOPS": str(len(stops)),
+        "STOPPED": initializer(k for k, _, _ in stops),
+        "STOPPED_PLACE": initializer(int(tree.q_index[k]) for k, _, _ in stops),
+        "SIDE": initializer(side for _, side, _ in stops),
+        "STOP": initializer(x for _, _, x in stops),
+        "RESTITUTION": initializer(mechanism.joints.restitution[k] for k, _, _ in stops),
+        "NO_FORCE": initializer(ZERO_ACCELERATION * inertia[k] for k, _, _ in stops),
         "IS_SPF": str(int(epsilon is not None)),
         "EPSILON": repr(epsilon or 1.0),
         "RTOL": repr(rtol),
         "START": initializer(start.at.q_tree),
         "START_RATES": initializer(start.q_dot),
+        "STATE": initializer(sorted(mechanism.partition.q.tolist())),
         "STAGES": str(len(DOP853.B)),
         "A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
         "B": initializer(DOP853.B),
         "E3": initializer(DOP853.E3),
         "E5": initializer(DOP853.E5),
     }
-    return fill_templates(mechanism, prefix, texts, more)
+    return fill_templates(mechanism, prefix, texts, more, derivatives=True)
 
 
 def _matrix(rows: Array) -> str:

@@ -4,6 +4,15 @@
 
 @TABLES@
 
+/* Places of q and z in v_tree. An FMU changes them. */
+#ifdef MECH_CHARTS
+#define Q_OF(at) (at)->independent
+#define Z_OF(at) (at)->dependent
+#else
+#define Q_OF(at) INDEPENDENT
+#define Z_OF(at) DEPENDENT
+#endif
+
 /* --- terms of the tree and of the loops, as straight-line code --- */
 
 @FUNCTIONS@
@@ -99,7 +108,7 @@ static mech_status evaluate_loops(const mech_model *model, mech_configuration *a
   code_place(at->q_tree, at->trig, model->numbers, at->phi, at->J);
   if (!is_finite(at->phi, MECH_ROWS)) return MECH_NOT_FINITE;
   for (int k = 0; k < MECH_Z; ++k)
-    for (int i = 0; i < MECH_Z; ++i) at->phi_z[i + MECH_Z * k] = at->J[KEPT[i] + MECH_ROWS * DEPENDENT[k]];
+    for (int i = 0; i < MECH_Z; ++i) at->phi_z[i + MECH_Z * k] = at->J[KEPT[i] + MECH_ROWS * Z_OF(at)[k]];
   return factorize(at->phi_z, at->pivot, MECH_Z) ? MECH_OK : MECH_SINGULAR;
 }
 
@@ -112,25 +121,32 @@ static void close_rows(const mech_configuration *at, const double *rows, double 
 static void compute_rho(mech_configuration *at) {
   for (int k = 0; k < MECH_D; ++k) {
     double z[MECH_SIZE(MECH_Z)], *column = at->rho + MECH_N * k;
-    close_rows(at, at->J + MECH_ROWS * INDEPENDENT[k], z);
-    for (int i = 0; i < MECH_D; ++i) column[INDEPENDENT[i]] = 0.0;
-    column[INDEPENDENT[k]] = 1.0;
-    for (int i = 0; i < MECH_Z; ++i) column[DEPENDENT[i]] = z[i];
+    close_rows(at, at->J + MECH_ROWS * Q_OF(at)[k], z);
+    for (int i = 0; i < MECH_D; ++i) column[Q_OF(at)[i]] = 0.0;
+    column[Q_OF(at)[k]] = 1.0;
+    for (int i = 0; i < MECH_Z; ++i) column[Z_OF(at)[i]] = z[i];
   }
+}
+
+/* Rotate s by the quaternion r (x, y, z, w). */
+static void rotate(const double *r, const double *s, double *rotated) {
+  const double x = r[0], y = r[1], z = r[2], w = r[3];
+  const double a = 2.0 * (y * s[2] - z * s[1]), b = 2.0 * (z * s[0] - x * s[2]), c = 2.0 * (x * s[1] - y * s[0]);
+  rotated[0] = s[0] + w * a + y * c - z * b;
+  rotated[1] = s[1] + w * b + z * a - x * c;
+  rotated[2] = s[2] + w * c + x * b - y * a;
 }
 
 /* Move the configuration by a tangent step. A free root moves along its own axes. */
 static void move(double *q_tree, const double *step) {
   for (int k = 0; k < JOINTS; ++k) q_tree[JOINT[k][0]] += step[JOINT[k][1]];
   for (int k = 0; k < ROOTS; ++k) {
-    double *p = q_tree + ROOT[k][0], *r = p + 3;
-    const double *s = step + ROOT[k][1], *half = s + 3;
+    double *p = q_tree + ROOT[k][0], *r = p + 3, shift[3];
+    const double *s = step + ROOT[k][1];
     const double x = r[0], y = r[1], z = r[2], w = r[3];
-    const double a = 2.0 * (y * s[2] - z * s[1]), b = 2.0 * (z * s[0] - x * s[2]), c = 2.0 * (x * s[1] - y * s[0]);
-    p[0] += s[0] + w * a + y * c - z * b;
-    p[1] += s[1] + w * b + z * a - x * c;
-    p[2] += s[2] + w * c + x * b - y * a;
-    const double u = 0.5 * half[0], v = 0.5 * half[1], t = 0.5 * half[2];
+    const double u = 0.5 * s[3], v = 0.5 * s[4], t = 0.5 * s[5];
+    rotate(r, s, shift);
+    for (int i = 0; i < 3; ++i) p[i] += shift[i];
     r[0] = x + w * u + y * t - z * v;
     r[1] = y + w * v + z * u - x * t;
     r[2] = z + w * t + x * v - y * u;
@@ -157,14 +173,14 @@ static double tolerance(const double *q_tree) {
 mech_status mech_sigma(const mech_model *model, const double *q, mech_configuration *at) {
   double dq[MECH_D], step[MECH_N], previous = HUGE_VAL;
   if (!is_finite(q, MECH_D)) return MECH_NOT_FINITE;
-  for (int k = 0; k < MECH_D; ++k) dq[k] = q[k] - at->q_tree[mech_q_places[k]];
+  for (int k = 0; k < MECH_D; ++k) dq[k] = q[k] - at->q_tree[PLACE[Q_OF(at)[k]]];
   multiply(at->rho, dq, step, MECH_N, MECH_D);
   for (int iteration = 0;; ++iteration) {
     double longest = 0.0, size = 0.0, z[MECH_SIZE(MECH_Z)];
-    for (int k = 0; k < MECH_Z; ++k) longest = fmax(longest, fabs(step[DEPENDENT[k]]) / SCALE[DEPENDENT[k]]);
+    for (int k = 0; k < MECH_Z; ++k) longest = fmax(longest, fabs(step[Z_OF(at)[k]]) / SCALE[Z_OF(at)[k]]);
     if (!(longest <= MECH_MAX_STEP)) return MECH_NOT_CLOSED;
     move(at->q_tree, step);
-    for (int k = 0; k < MECH_D; ++k) at->q_tree[mech_q_places[k]] = q[k];
+    for (int k = 0; k < MECH_D; ++k) at->q_tree[PLACE[Q_OF(at)[k]]] = q[k];
     const mech_status status = evaluate_loops(model, at);
     if (status != MECH_OK) return status;
     for (int i = 0; i < MECH_Z; ++i) size = fmax(size, fabs(at->phi[KEPT[i]]));
@@ -172,8 +188,8 @@ mech_status mech_sigma(const mech_model *model, const double *q, mech_configurat
     if (!(size <= 0.5 * previous) || iteration == MECH_MAX_ITERATIONS) return MECH_NOT_CLOSED;
     previous = size;
     close_rows(at, at->phi, z);
-    for (int k = 0; k < MECH_D; ++k) step[INDEPENDENT[k]] = 0.0;
-    for (int k = 0; k < MECH_Z; ++k) step[DEPENDENT[k]] = z[k];
+    for (int k = 0; k < MECH_D; ++k) step[Q_OF(at)[k]] = 0.0;
+    for (int k = 0; k < MECH_Z; ++k) step[Z_OF(at)[k]] = z[k];
   }
   compute_rho(at);
   return MECH_OK;
@@ -181,7 +197,7 @@ mech_status mech_sigma(const mech_model *model, const double *q, mech_configurat
 
 mech_status mech_move(const mech_model *model, const double *q, mech_configuration *at) {
   double start[MECH_D], waypoint[MECH_D];
-  for (int k = 0; k < MECH_D; ++k) start[k] = at->q_tree[mech_q_places[k]];
+  for (int k = 0; k < MECH_D; ++k) start[k] = at->q_tree[PLACE[Q_OF(at)[k]]];
   for (int piece = 1; piece <= MECH_PIECES; ++piece) {
     const double rest = (double)(MECH_PIECES - piece) / MECH_PIECES;
     for (int k = 0; k < MECH_D; ++k) waypoint[k] = q[k] - rest * (q[k] - start[k]);
@@ -203,7 +219,7 @@ void mech_tree_acceleration(const mech_model *model, const mech_configuration *a
   mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
   close_rows(at, J_dot_v, z);
   multiply(at->rho, q_ddot, acceleration, MECH_N, MECH_D);
-  for (int k = 0; k < MECH_Z; ++k) acceleration[DEPENDENT[k]] += z[k];
+  for (int k = 0; k < MECH_Z; ++k) acceleration[Z_OF(at)[k]] += z[k];
 }
 
 void mech_points(const mech_model *model, const mech_configuration *at, const double *v_tree, double *positions,
@@ -255,7 +271,7 @@ static void inertial_force(const mech_model *model, const mech_configuration *at
   mech_velocity(at, a, acceleration);
   code_bilinear(at->q_tree, at->trig, v_tree, x_tree, model->numbers, velocity_force, J_dot_x);
   close_rows(at, J_dot_x, z);
-  for (int k = 0; k < MECH_Z; ++k) acceleration[DEPENDENT[k]] += z[k];
+  for (int k = 0; k < MECH_Z; ++k) acceleration[Z_OF(at)[k]] += z[k];
   multiply(D_tree, acceleration, force, MECH_N, MECH_N);
   for (int k = 0; k < MECH_N; ++k) force[k] += velocity_force[k];
 }
@@ -280,20 +296,24 @@ void mech_h(const mech_model *model, const mech_configuration *at, double *h) {
 
 /* --- dynamics --- */
 
-void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
-                      const double *u_tree, const double *acceleration, double *multipliers) {
-  double D_tree[MECH_N * MECH_N], force[MECH_N], bias_tree[MECH_N], damping[MECH_N];
-  double J_dot_v[MECH_SIZE(MECH_ROWS)], z[MECH_SIZE(MECH_Z)];
+/* Solve D' acceleration = force + J^T multipliers for the multipliers. */
+static void solve_multipliers(const mech_model *model, const mech_configuration *at, const double *force,
+                              const double *acceleration, double *multipliers) {
+  double D_tree[MECH_N * MECH_N], inertial[MECH_N], z[MECH_SIZE(MECH_Z)];
   mech_D_tree(model, at, D_tree);
-  mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
-  multiply(D_tree, acceleration, force, MECH_N, MECH_N);
-  for (int k = 0; k < MECH_Z; ++k) {
-    const int i = DEPENDENT[k];
-    z[k] = force[i] + bias_tree[i] - damping[i] - u_tree[i];
-  }
+  multiply(D_tree, acceleration, inertial, MECH_N, MECH_N);
+  for (int k = 0; k < MECH_Z; ++k) z[k] = inertial[Z_OF(at)[k]] - force[Z_OF(at)[k]];
   solve_transposed(at->phi_z, at->pivot, MECH_Z, z);
   for (int i = 0; i < MECH_ROWS; ++i) multipliers[i] = 0.0;
   for (int k = 0; k < MECH_Z; ++k) multipliers[KEPT[k]] = z[k];
+}
+
+void mech_multipliers(const mech_model *model, const mech_configuration *at, const double *v_tree,
+                      const double *u_tree, const double *acceleration, double *multipliers) {
+  double force[MECH_N], bias_tree[MECH_N], damping[MECH_N], J_dot_v[MECH_SIZE(MECH_ROWS)];
+  mech_bias_tree(model, at, v_tree, bias_tree, J_dot_v, damping);
+  for (int k = 0; k < MECH_N; ++k) force[k] = u_tree[k] + damping[k] - bias_tree[k];
+  solve_multipliers(model, at, force, acceleration, multipliers);
 }
 
 mech_status mech_acceleration(const mech_model *model, const mech_configuration *at, const double *v_tree,
@@ -398,7 +418,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
   for (int stage = 0; stage < 4; ++stage) {
     if (stage > 0) {
       for (int k = 0; k < MECH_D; ++k) {
-        q[k] = motion->at.q_tree[mech_q_places[k]] + part[stage] * step * q_dot[k];
+        q[k] = motion->at.q_tree[PLACE[Q_OF(&motion->at)[k]]] + part[stage] * step * q_dot[k];
         q_dot[k] = motion->q_dot[k] + part[stage] * step * q_ddot[k];
       }
       status = mech_sigma(model, q, &at);
@@ -411,7 +431,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
       dv[k] += weight[stage] * step * q_ddot[k];
     }
   }
-  for (int k = 0; k < MECH_D; ++k) q[k] = motion->at.q_tree[mech_q_places[k]] + dq[k];
+  for (int k = 0; k < MECH_D; ++k) q[k] = motion->at.q_tree[PLACE[Q_OF(&motion->at)[k]]] + dq[k];
   status = mech_sigma(model, q, &at);
   if (status != MECH_OK) return status;
   motion->at = at;

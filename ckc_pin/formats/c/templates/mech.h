@@ -71,6 +71,9 @@ typedef struct {
   double phi_z[MECH_SIZE(MECH_Z * MECH_Z)];           /* factorized */
   int pivot[MECH_SIZE(MECH_Z)];
   double rho[MECH_N * MECH_D];                        /* v' = rho q_dot, (MECH_N, MECH_D) */
+#ifdef MECH_CHARTS
+  int independent[MECH_D], dependent[MECH_SIZE(MECH_Z)]; /* places of q and z in v_tree, which an FMU changes */
+#endif
 } mech_configuration;
 
 /* --- model and configurations --- */

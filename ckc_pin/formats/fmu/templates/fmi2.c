@@ -164,8 +164,7 @@ FMI2_Export fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte b
 FMI2_Export fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[], size_t n,
                                                     const fmi2ValueReference knowns[], size_t m,
                                                     const fmi2Real seed[], fmi2Real derivative[]) {
-  (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)derivative;
-  return report(c, fmi2Error, "there are no directional derivatives");
+  return check(c, fmu_get_changes(&((instance *)c)->state, unknowns, n, knowns, m, seed, derivative));
 }
 
 /* --- model exchange --- */
@@ -173,9 +172,9 @@ FMI2_Export fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2V
 FMI2_Export fmi2Status fmi2EnterEventMode(fmi2Component c) { return (void)c, fmi2OK; }
 
 FMI2_Export fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
-  (void)c;
   memset(info, 0, sizeof *info);
-  return fmi2OK;
+  info->valuesOfContinuousStatesChanged = STOPS > 0;
+  return result(c, update_stops(&((instance *)c)->state), fmi2Error);
 }
 
 FMI2_Export fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return (void)c, fmi2OK; }
@@ -202,8 +201,8 @@ FMI2_Export fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[
 }
 
 FMI2_Export fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real indicators[], size_t n) {
-  (void)indicators;
-  return n == 0 ? fmi2OK : report(c, fmi2Error, "there are no event indicators");
+  if (n != STOPS) return report(c, fmi2Error, "wrong number of event indicators");
+  return result(c, fmu_get_indicators(&((instance *)c)->state, indicators), fmi2Discard);
 }
 
 FMI2_Export fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real states[], size_t n) {

@@ -228,15 +228,19 @@ FMI3_Export fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueRefe
   return report(c, fmi3Error, "dependencies are not known at run time");
 }
 
-#define DERIVATIVE_FUNCTION(Function)                                                                           \
-  FMI3_Export fmi3Status Function(fmi3Instance c, const fmi3ValueReference unknowns[], size_t n,                \
-                                  const fmi3ValueReference knowns[], size_t m, const fmi3Float64 seed[],        \
-                                  size_t seed_size, fmi3Float64 derivative[], size_t size) {                    \
-    (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)seed_size, (void)derivative, (void)size;  \
-    return report(c, fmi3Error, "there are no directional or adjoint derivatives");                             \
-  }
-DERIVATIVE_FUNCTION(fmi3GetDirectionalDerivative)
-DERIVATIVE_FUNCTION(fmi3GetAdjointDerivative)
+FMI3_Export fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, references unknowns, size_t n, references knowns,
+                                                    size_t m, const fmi3Float64 seed[], size_t seed_size,
+                                                    fmi3Float64 derivative[], size_t size) {
+  if (seed_size != m || size != n) return report(c, fmi3Error, "all variables are scalars");
+  return check(c, fmu_get_changes(&((instance *)c)->state, unknowns, n, knowns, m, seed, derivative));
+}
+
+FMI3_Export fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, references unknowns, size_t n, references knowns,
+                                                size_t m, const fmi3Float64 seed[], size_t seed_size,
+                                                fmi3Float64 derivative[], size_t size) {
+  (void)unknowns, (void)n, (void)knowns, (void)m, (void)seed, (void)seed_size, (void)derivative, (void)size;
+  return report(c, fmi3Error, "there are no adjoint derivatives");
+}
 
 FMI3_Export fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference r[], size_t n,
                                                 const fmi3Int32 orders[], fmi3Float64 values[], size_t size) {
@@ -279,10 +283,10 @@ FMI3_Export fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte by
 FMI3_Export fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *needs_update, fmi3Boolean *terminates,
                                                 fmi3Boolean *nominals_changed, fmi3Boolean *states_changed,
                                                 fmi3Boolean *has_next_event, fmi3Float64 *next_event) {
-  (void)c;
-  *needs_update = *terminates = *nominals_changed = *states_changed = *has_next_event = false;
+  *needs_update = *terminates = *nominals_changed = *has_next_event = false;
+  *states_changed = STOPS > 0;
   *next_event = 0.0;
-  return fmi3OK;
+  return result(c, update_stops(&((instance *)c)->state), fmi3Error);
 }
 
 FMI3_Export fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_return, fmi3Boolean *enters_events,
@@ -307,8 +311,8 @@ FMI3_Export fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Flo
 }
 
 FMI3_Export fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 indicators[], size_t n) {
-  (void)indicators;
-  return n == 0 ? fmi3OK : report(c, fmi3Error, "there are no event indicators");
+  if (n != STOPS) return report(c, fmi3Error, "wrong number of event indicators");
+  return result(c, fmu_get_indicators(&((instance *)c)->state, indicators), fmi3Discard);
 }
 
 FMI3_Export fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 states[], size_t n) {
@@ -323,7 +327,7 @@ FMI3_Export fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Flo
 
 FMI3_Export fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) {
   (void)c;
-  *n = 0;
+  *n = STOPS;
   return fmi3OK;
 }
 
