@@ -855,3 +855,27 @@ class ManyInstants:
         self, arguments: list[numpy.typing.NDArray[numpy.float64]], results: list[numpy.typing.NDArray[numpy.float64]]
     ) -> None:
         """Write results (instants, entries) at arguments (instants, entries)."""
+
+def fastest_profile(
+    A: numpy.typing.NDArray[numpy.float64],
+    B: numpy.typing.NDArray[numpy.float64],
+    C: numpy.typing.NDArray[numpy.float64],
+    *,
+    largest: numpy.typing.NDArray[numpy.float64],
+    start: float,
+    end: float,
+) -> tuple[numpy.typing.NDArray[numpy.float64] | None, int, float]:
+    """
+    The largest b at the points of a grid under rows A y + B b <= C of each interval, from start to end. Without one: an interval in which no b fulfils the rows, and y there.
+    """
+
+def largest_b(
+    A: numpy.typing.NDArray[numpy.float64],
+    B: numpy.typing.NDArray[numpy.float64],
+    C: numpy.typing.NDArray[numpy.float64],
+    *,
+    bound: float,
+) -> numpy.typing.NDArray[numpy.float64]:
+    """
+    The largest b up to a bound under rows A y + B b <= C with any y, for each group of rows.
+    """

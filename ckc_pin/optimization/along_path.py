@@ -15,6 +15,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.dynamics.inverse import friction_force
 from ckc_pin.errors import InputError, NumericalError
+from ckc_pin.native import _core
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath
 from ckc_pin.optimization.reduced import ReducedDynamics
@@ -24,7 +25,6 @@ from ckc_pin.optimization.speed_profile import (
     SpeedRows,
     estimate_slopes,
     fastest_profile,
-    find_vertex,
 )
 
 __all__ = ["PathDynamics", "find_fastest", "minimum_norm_within", "path_dynamics"]
@@ -254,7 +254,7 @@ def _reachable_b(path: PathDynamics, alpha: Array, beta: Array, gamma: Array) ->
     if not np.isfinite(up).all():
         raise InputError("optimize: limits: nothing limits the speed along the path; give torque, rate or acceleration")
     reached = 1e3 * 2 * np.ptp(path.s) * max(float(np.abs(up).max()), 1e-300)
-    return find_vertex(alpha, beta, gamma, np.full(len(up), reached), 1.0)[0]
+    return _core.largest_b(alpha, beta, gamma, bound=reached)
 
 
 def minimum_norm_within(transmission: Array, force: Array, limit: Array) -> Array:

@@ -15,12 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.native import _core
 
-__all__ = ["Blocked", "SpeedProfile", "SpeedRows", "estimate_slopes", "fastest_profile", "find_vertex"]
+__all__ = ["Blocked", "SpeedProfile", "SpeedRows", "estimate_slopes", "fastest_profile"]
 
-MAX_VERTEX_STEPS = 100
 MAX_TIME_STEPS = 20  # of Newton's method for the duration of an interval
-TOLERANCE = 1e-11  # relative: of what a limit may be exceeded by because of rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,33 +131,8 @@ def fastest_profile(
         Of u by s in the intervals; default: u is constant.
     """
     A, B, C = _rows_by_ends(s, rows, slopes)
-    highest, lowest = _extreme_ends(A, B, C, rows.largest)
-    count = len(s) - 1
-    low, high = np.zeros(count + 1), np.zeros(count + 1)
-    low[count] = high[count] = end
-    listed = [list(zip(a, b, c, strict=True)) for a, b, c in zip(A.tolist(), B.tolist(), C.tolist(), strict=True)]
-    largest = rows.largest.tolist()
-    highest_y, lowest_y = highest.tolist(), lowest.tolist()
-    lo, hi = float(end), float(end)
-    tolerance = TOLERANCE * float(rows.largest.max())
-    for k in range(count - 1, -1, -1):
-        up, low_at_top = _b_range(listed[k], largest[k], min(max(highest_y[k], lo), hi))
-        high_at_bottom, down = _b_range(listed[k], largest[k], min(max(lowest_y[k], lo), hi))
-        if not (up >= low_at_top - tolerance and high_at_bottom >= down - tolerance):
-            return Blocked(k, _tightest(A[k], B[k], C[k], min(max(highest_y[k], lo), hi)))
-        lo, hi = down, max(up, down)
-        low[k], high[k] = lo, hi
-    if not lo - tolerance <= start <= hi + tolerance:
-        return Blocked(0, _tightest(A[0], B[0], C[0], high[1]))
-    b = [start]
-    ends = high.tolist()
-    for k in range(count):
-        here, y = b[-1], ends[k + 1]
-        for a, c, limit in listed[k]:
-            if a > 0.0:
-                y = min(y, (limit - c * here) / a)
-        b.append(max(y, low[k + 1], 0.0))
-    return np.array(b)
+    b, interval, y = _core.fastest_profile(A, B, C, largest=rows.largest, start=start, end=end)
+    return Blocked(interval, _tightest(A[interval], B[interval], C[interval], y)) if b is None else b
 
 
 def _rows_by_ends(s: Array, rows: SpeedRows, slopes: Array | float) -> tuple[Array, Array, Array]:
@@ -170,58 +144,6 @@ def _rows_by_ends(s: Array, rows: SpeedRows, slopes: Array | float) -> tuple[Arr
     A, B, C = (np.hstack([x, y]) for x, y in zip(at_start, at_end, strict=True))
     size = np.maximum(np.abs(A).max(axis=1, initial=1e-300, keepdims=True) * 1e-14, 1e-300)
     return np.where(np.abs(A) > size, A, 0.0), np.where(np.abs(B) > size, B, 0.0), C
-
-
-def _b_range(rows: list[tuple[float, float, float]], largest: float, y: float) -> tuple[float, float]:
-    """Return the largest and the smallest b of an interval for a given y; an empty range if there is none."""
-    up, down = largest, 0.0
-    for a, b, c in rows:
-        rest = c - a * y
-        if b > 0.0:
-            up = min(up, rest / b)
-        elif b < 0.0:
-            down = max(down, rest / b)
-        elif rest < -TOLERANCE * (abs(c) + abs(a * y)):
-            return -np.inf, np.inf
-    return up, down
-
-
-def _extreme_ends(A: Array, B: Array, C: Array, largest: Array) -> tuple[Array, Array]:
-    """Return the y at which b is largest, and that at which it is smallest, in each interval."""
-    one, zero = np.ones((len(A), 1)), np.zeros((len(A), 1))
-    A = np.hstack([A, one, -one])
-    B = np.hstack([B, zero, zero])
-    C = np.hstack([C, largest[1:, None], zero])
-    return find_vertex(A, B, C, largest[:-1], 1.0)[1], find_vertex(A, B, C, zero[:, 0], -1.0)[1]
-
-
-def find_vertex(A: Array, B: Array, C: Array, b: Array, sign: float) -> tuple[Array, Array]:
-    """Return the largest (sign = 1) or smallest (sign = -1) b of A y + B b <= C up to a bound, and the y there.
-
-    The width in y of the feasible set is a concave function of b. Newton's method finds its zero from the outside.
-
-    Parameters
-    ----------
-    A, B, C : (count, rows) arrays
-    b : (count,) array
-        The bound.
-    """
-    up, down, flat, at = A > 0, A < 0, A == 0, np.arange(len(A))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope, right = B / A, C / A
-        level = sign * np.where(flat & (sign * B > 0), C / B, sign * np.inf)
-    b = sign * np.minimum(sign * b, level.min(axis=1, initial=np.inf))
-    for _ in range(MAX_VERTEX_STEPS):
-        with np.errstate(invalid="ignore", over="ignore"):
-            y = right - slope * b[:, None]
-        above, below = np.where(up, y, np.inf), np.where(down, y, -np.inf)
-        i, j = above.argmin(axis=1), below.argmax(axis=1)
-        width, change = above[at, i] - below[at, j], slope[at, j] - slope[at, i]
-        outside = (width < 0) & (sign * change < 0)
-        if not outside.any():
-            break
-        b = np.where(outside, b - width / np.where(outside, change, 1.0), b)
-    return b, (above[at, i] + below[at, j]) / 2
 
 
 def _tightest(A: Array, B: Array, C: Array, y: float) -> int:

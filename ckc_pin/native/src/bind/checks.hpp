@@ -93,6 +93,7 @@ void bind_loop(nb::module_& m);
 void bind_gate(nb::module_& m);
 void bind_batch(nb::module_& m);
 void bind_many(nb::module_& m);
+void bind_speed_profile(nb::module_& m);
 void bind_linearization(nb::module_& m);
 
 }  // namespace ckc

@@ -12,4 +12,5 @@ NB_MODULE(_core, m) {
   ckc::bind_batch(m);
   ckc::bind_linearization(m);
   ckc::bind_many(m);
+  ckc::bind_speed_profile(m);
 }
