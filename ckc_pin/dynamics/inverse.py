@@ -22,12 +22,12 @@ REST_TOLERANCE = 1e-12  # of the fastest coordinate: a smaller velocity is round
 
 
 def friction_force(mechanism: Mechanism, v_tree: Array) -> Array:
-    """Return the generalized force of dry friction in joints that slide, -friction sign(v'), shape (n,).
+    """Return the generalized force of dry friction in joints that slide, -friction sign(v'), (n,) or (m, n) as v'.
 
     It is zero for joints at rest, where friction takes any value up to the largest one and velocity does not tell.
     """
     speed = np.abs(v_tree / mechanism.tree.step_scale)
-    slides = speed > REST_TOLERANCE * speed.max(initial=0.0)
+    slides = speed > REST_TOLERANCE * speed.max(axis=-1, initial=0.0, keepdims=True)
     return np.where(slides, -mechanism.joints.friction * np.sign(v_tree), 0.0)
 
 

@@ -91,7 +91,7 @@ def path_dynamics(
     back = dynamics.instants(q_tree, -q_s, q_ss, no_torque)
     pushed = dynamics.instants(q_tree, zero, q_s, no_torque)
     rho = dynamics.rho(q_tree)
-    friction = np.array([friction_force(mechanism, v) for v in forth.v_tree])
+    friction = friction_force(mechanism, forth.v_tree)
     return PathDynamics(
         s=s,
         q_tree=q_tree,

@@ -214,7 +214,7 @@ def _instants(
     q_tree = follow_places(dynamics, q, t)
     at = dynamics.instants(q_tree, v, a, np.zeros((len(t), dynamics.motors)))
     rho = dynamics.rho(q_tree)
-    friction = np.array([friction_force(mechanism, x) for x in at.v_tree])
+    friction = friction_force(mechanism, at.v_tree)
     force = at.force - np.einsum("mnd,mn->md", rho, friction)
     transmission = np.einsum("mnd,kn->mdk", rho, mechanism.motors.transmission)
     tau = minimum_norm_within(transmission, force, limits.torque)
