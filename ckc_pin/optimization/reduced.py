@@ -111,10 +111,13 @@ class ReducedDynamics:
         passive = substitute(terms.inverse_dynamics - terms.damping)
         balance = passive - cs.mtimes(transmission.T, tau) - cs.mtimes(J.T, multipliers)
         self._symbols = q, v, a, multipliers
+        self.state_symbols = q, v, a, tau
+        self.phi_z = J[:, self.z_at.tolist()]
+        self.points = substitute(terms.points[0])
         self._rows = phi, cs.mtimes(J, v), acceleration, balance
-        self._closure = _function([q], [phi, cs.jacobian(phi, q)])
-        self._rates = _function([q, v], [J, J_dot_v])
-        self._passive = _function([q, v, a], [passive])
+        self._closure = InstantsFunction.of([q], [phi, cs.jacobian(phi, q)])
+        self._rates = InstantsFunction.of([q, v], [J, J_dot_v])
+        self._passive = InstantsFunction.of([q, v, a], [passive])
 
     @cached_property
     def _first(self) -> InstantsFunction:
@@ -124,7 +127,7 @@ class ReducedDynamics:
         (q, v, a, _), (phi, rate, acceleration, balance) = self._symbols, self._rows
         by = ((phi, q), (rate, v), (rate, q), (acceleration, q), (acceleration, v), (balance, q), (balance, v),
               (balance, a))  # fmt: skip
-        return _function(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
+        return InstantsFunction.of(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
 
     @cached_property
     def _second(self) -> InstantsFunction:
@@ -136,7 +139,7 @@ class ReducedDynamics:
         lagrangian = sum(cs.dot(w, x) for w, x in zip(weights, self._rows, strict=True))
         by_q, by_v = cs.gradient(lagrangian, q), cs.gradient(lagrangian, v)
         pairs = ((by_q, q), (by_q, v), (by_v, v), (by_q, a), (by_q, multipliers))
-        return _function([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
+        return InstantsFunction.of([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
 
     # --- values ----------------------------------------------------------------------------------
 
@@ -274,29 +277,35 @@ class ReducedDynamics:
         force = balance[:, q_at] - J_q.transpose(0, 2, 1) @ multipliers
         return Derivatives(q_tree, v_tree, a_tree, multipliers, force, tuple(blocks))
 
+    def state_derivatives(self, by_x: Derivatives) -> Array:
+        """Return the derivatives of the state (q', v', dv'/dt, tau) of each instant, (m, nq + 2 n + motors, size)."""
+        tau = np.zeros((len(by_x.q_tree), self.motors, by_x.q_tree.shape[2]))
+        tau[:, np.arange(self.motors), 3 * self.d + np.arange(self.motors)] = 1.0
+        return np.concatenate([by_x.q_tree, by_x.v_tree, by_x.a_tree, tau], axis=1)
+
     def hessian(
-        self, at: MotionInstants, by_x: Derivatives, weights: Array, q_weights: Array | None = None,
-        v_weights: Array | None = None,
-    ) -> Array:  # fmt: skip
+        self, at: MotionInstants, by_x: Derivatives, weights: Array, state_weights: Array | None = None
+    ) -> Array:
         """Return the second derivatives of weights (m, d) times the missing force, (m, 3 d + motors, 3 d + motors).
 
         Parameters
         ----------
-        q_weights : (m, nq) array, optional
-            The result includes the second derivatives of these weights times the configuration.
-        v_weights : (m, n) array, optional
-            The same of the rates v'.
+        state_weights : (m, nq + 2 n + motors) array, optional
+            The result includes the second derivatives of these weights times the state (q', v', dv'/dt, tau).
         """
         z_at = self.z_at
         phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = by_x.blocks
         inverse = _inverse(J[:, :, z_at])
         w_balance = _times(self._rho(J, inverse), weights)
         to_rows = inverse.transpose(0, 2, 1)
-        w_acceleration = -_times(to_rows, _transposed(balance_a, w_balance)[:, z_at])
-        by_v = _transposed(balance_v, w_balance) + _transposed(acc_v, w_acceleration)
-        w_rate = -_times(to_rows, (by_v if v_weights is None else by_v + v_weights)[:, z_at])
+        nq, n = self.mechanism.tree.nq, self.n
+        extra = np.zeros((len(weights), nq + 2 * n + self.motors)) if state_weights is None else state_weights
+        by_a = _transposed(balance_a, w_balance) + extra[:, nq + n : nq + 2 * n]
+        w_acceleration = -_times(to_rows, by_a[:, z_at])
+        by_v = _transposed(balance_v, w_balance) + _transposed(acc_v, w_acceleration) + extra[:, nq : nq + n]
+        w_rate = -_times(to_rows, by_v[:, z_at])
         by_q = _transposed(balance_q, w_balance) + _transposed(acc_q, w_acceleration) + _transposed(rate_q, w_rate)
-        by_q = by_q if q_weights is None else by_q + q_weights
+        by_q += extra[:, :nq]
         inverse_q = _inverse(phi_q[:, :, self.z_in_tree])
         w_phi = -_times(inverse_q.transpose(0, 2, 1), by_q[:, self.z_in_tree])
         qq, qv, vv, qa, ql = self._second(
@@ -305,12 +314,6 @@ class ReducedDynamics:
         mixed = qq @ by_x.q_tree / 2 + qv @ by_x.v_tree + qa @ by_x.a_tree + ql @ by_x.multipliers
         half = by_x.q_tree.transpose(0, 2, 1) @ mixed + by_x.v_tree.transpose(0, 2, 1) @ (vv @ by_x.v_tree) / 2
         return half + half.transpose(0, 2, 1)
-
-
-def _function(inputs: list[Any], outputs: list[Any]) -> InstantsFunction:
-    import casadi as cs
-
-    return InstantsFunction(cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True}))
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
