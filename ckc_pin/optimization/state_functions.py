@@ -76,12 +76,14 @@ class SmallestSingularValue:
     Parameters
     ----------
     dynamics : ReducedDynamics
+    unit : float
+        Unit of the value.
     """
 
-    def __init__(self, dynamics: ReducedDynamics) -> None:
+    def __init__(self, dynamics: ReducedDynamics, unit: float = 1.0) -> None:
         import casadi as cs
 
-        q, phi_z = dynamics.state_symbols[0], dynamics.phi_z
+        q, phi_z = dynamics.state_symbols[0], dynamics.phi_z / unit
         self._entries = dynamics.mechanism.tree.nq + 2 * dynamics.n + dynamics.motors
         self._nq = dynamics.mechanism.tree.nq
         column = cs.vec(cs.densify(phi_z))
