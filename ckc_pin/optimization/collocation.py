@@ -195,8 +195,8 @@ class Collocation:
                 effort += unit**2 * cs.dot(cs.DM(self.step / 3), a**2 + a * b + b**2)
             parts["effort"] = T * effort
         if minimize.energy:
-            slack = w[self.slack_at.ravel().tolist()]
-            parts["energy"] = T * self.power_unit * cs.dot(cs.DM(np.repeat(shares, self.slacks)), slack)
+            power = w[self.slack_at.ravel().tolist()]
+            parts["energy"] = T * self.power_unit * cs.dot(cs.DM(np.repeat(shares, self.slacks)), power)
         if minimize.tracking:
             missing = self._at_points(w, 0) - p[2 * self.d :]
             parts["tracking"] = T * cs.dot(cs.DM(np.repeat(shares, self.d)), missing**2)

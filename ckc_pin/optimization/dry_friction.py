@@ -1,6 +1,6 @@
 """Dry friction in optimal control: its directions in each interval, with knots where joints turn back.
 
-The direction of each joint's motion is not known beforehand. A problem with smoothed friction is solved first. Then the
+The direction of each joint's motion depends on the solution. A problem with smoothed friction is solved first. Then the
 joints of its solution have their directions in each interval, and knots are placed where they turn back. The problem
 with these directions is smooth and exact. Its solution moves the knots, until they stay.
 """

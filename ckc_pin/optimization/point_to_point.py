@@ -128,10 +128,10 @@ def read_desired_motion(
 
 def _divide(mesh: Array, intervals: BoolArray) -> Array:
     """Return a mesh with intervals and their neighbours halved."""
-    near = intervals.copy()
-    near[1:] |= intervals[:-1]
-    near[:-1] |= intervals[1:]
-    return np.sort(np.concatenate([mesh, ((mesh[1:] + mesh[:-1]) / 2)[near]]))
+    halved = intervals.copy()
+    halved[1:] |= intervals[:-1]
+    halved[:-1] |= intervals[1:]
+    return np.sort(np.concatenate([mesh, ((mesh[1:] + mesh[:-1]) / 2)[halved]]))
 
 
 def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:

@@ -98,8 +98,8 @@ class SmallestSingularValue:
     def _decompose(self, at: MotionInstants) -> tuple[Array, Array, Array, Array, Array]:
         """Return singular vectors and values, the smooth minimum, and its derivatives by the values."""
         U, sigma, Vt = np.linalg.svd(self._phi_z(at.q_tree)[0])
-        least = sigma[:, -1:]
-        bound = least * np.sum((least / sigma) ** SHARPNESS, axis=1, keepdims=True) ** (-1 / SHARPNESS)
+        sigma_min = sigma[:, -1:]
+        bound = sigma_min * np.sum((sigma_min / sigma) ** SHARPNESS, axis=1, keepdims=True) ** (-1 / SHARPNESS)
         return U, sigma, Vt, bound, (bound / sigma) ** (SHARPNESS + 1)
 
     def values(self, at: MotionInstants) -> Array:

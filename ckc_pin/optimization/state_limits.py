@@ -13,6 +13,8 @@ from ckc_pin.optimization.state_functions import ExpressionFunctions, SmallestSi
 
 __all__ = ["StateLimits"]
 
+ROUNDING = 1e-3  # of a sphere's radius
+
 Row = tuple[str, Any, float, float]  # label, expression, lower and upper limit
 
 
@@ -102,7 +104,9 @@ def _limited(dynamics: ReducedDynamics, limits: MotionLimits) -> list[Row]:
                  _symmetric(f"power.{name}", power[k], limits.power[k])]  # fmt: skip
     points = dict(zip(mechanism.points, cs.vertsplit(dynamics.points, 3), strict=True))
     for label, (point, centre, radius) in zip(limits.sphere_names, limits.spheres, strict=True):
-        rows.append((label, cs.sumsqr(points[point] - cs.DM(centre)) / radius**2, 1.0, np.inf))
+        # The distance is nearly linear in the position; a small part of the radius makes it smooth at the centre.
+        distance = cs.sqrt(cs.sumsqr(points[point] - cs.DM(centre)) + (ROUNDING * radius) ** 2)
+        rows.append((label, distance / mechanism.size, radius / mechanism.size, np.inf))
     return rows
 
 

@@ -34,7 +34,7 @@ def test_least_effort_against_dry_friction() -> None:
     "task", [{"limits": {"torque": 2.0}}, {"limits": {"torque": 2.0, "time": 0.5}, "minimize": {"effort": 1.0}}]
 )
 def test_passive_joints_that_turn_back_are_replayed(task: dict[str, Any]) -> None:
-    """Both passive joints turn back on the way, at places that are not known beforehand."""
+    """Both passive joints turn back on the way, at places that depend on the solution."""
     rubbing = ckc_pin.load("five_bar", {f"joint.theta_{k}.friction": 0.05 for k in (1, 2, 3, 4)})
     to = {"q": {"theta_1": -1.0, "theta_3": -1.9}}
     plan, smooth = (optimize(mechanism, to=to, **task) for mechanism in (rubbing, "five_bar"))
