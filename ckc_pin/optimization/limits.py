@@ -14,7 +14,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.motors import torque_limits
 from ckc_pin.optimization.spec import LimitsSpec
 
-__all__ = ["MotionLimits", "make_limits", "quantity_names"]
+__all__ = ["MotionLimits", "make_limits"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +27,20 @@ class MotionLimits(Immutable):
         Lower and upper, of all coordinates.
     rate, acceleration : (n,) arrays
     torque : (2, motors) array
-    speed : (motors,) array
+    speed, power : (motors,) arrays
         Of the shafts.
     torque_rate : (motors,) array
+    jerk : (d,) array
+        Of the independent coordinates.
     time : float
         s.
     singularity : float
         Smallest singular value of phi_z, relative to the start; 0 if there is no limit.
     spheres : tuple of (str, (3,) array, float)
         Point, centre and radius.
+    sphere_names : tuple of str
+    names : tuple of str
+        Coordinates, rates, accelerations, shaft speeds, torques, power, and distances of points from spheres' centres.
     """
 
     q: Array
@@ -43,10 +48,14 @@ class MotionLimits(Immutable):
     acceleration: Array
     torque: Array
     speed: Array
+    power: Array
     torque_rate: Array
+    jerk: Array
     time: float
     singularity: float
     spheres: tuple[tuple[str, Array, float], ...]
+    sphere_names: tuple[str, ...]
+    names: tuple[str, ...]
 
     def narrowed(self, part: float) -> MotionLimits:
         """Return the limits of rates, accelerations and motors narrowed by a part of themselves."""
@@ -59,19 +68,13 @@ class MotionLimits(Immutable):
         return np.maximum(lower - quantities, quantities - upper)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper limits of the quantities of `quantity_names`."""
+        """Return lower and upper limits of the quantities of `names`."""
         rates, accelerations, speeds = self.rate, self.acceleration, self.speed
+        radius = np.array([radius for _, _, radius in self.spheres])
         return (
-            np.concatenate([self.q[0], -rates, -accelerations, -speeds, self.torque[0]]),
-            np.concatenate([self.q[1], rates, accelerations, speeds, self.torque[1]]),
+            np.concatenate([self.q[0], -rates, -accelerations, -speeds, self.torque[0], -self.power, radius]),
+            np.concatenate([self.q[1], rates, accelerations, speeds, self.torque[1], self.power, np.inf + 0 * radius]),
         )
-
-
-def quantity_names(mechanism: Mechanism) -> tuple[str, ...]:
-    """Name coordinates, rates, accelerations, shaft speeds and torques, in this order."""
-    coordinates, motors = mechanism.coordinates, mechanism.motors.names
-    return (*coordinates, *(f"v.{x}" for x in coordinates), *(f"a.{x}" for x in coordinates),
-            *(f"speed.{x}" for x in motors), *(f"tau.{x}" for x in motors))  # fmt: skip
 
 
 def make_limits(spec: LimitsSpec, mechanism: Mechanism) -> MotionLimits:
@@ -82,6 +85,8 @@ def make_limits(spec: LimitsSpec, mechanism: Mechanism) -> MotionLimits:
     q[0], q[1] = np.maximum(q[0], mechanism.joints.lower), np.minimum(q[1], mechanism.joints.upper)
     for name, pair in spec.q.items():
         k = _index(name, names, f"{where}.q", "coordinate")
+        if name in mechanism.tree.free_coordinates and not mechanism.tree.in_metres[k]:
+            raise InputError(f"{where}.q.{name}: rotations of a free root have no limits; remove it")
         if not pair[0] < pair[1]:
             raise InputError(f"{where}.q.{name}: expected [lower, upper], got [{pair[0]:g}, {pair[1]:g}]")
         q[:, k] = max(q[0, k], pair[0]), min(q[1, k], pair[1])
@@ -94,21 +99,31 @@ def make_limits(spec: LimitsSpec, mechanism: Mechanism) -> MotionLimits:
     elif spec.torque != "motors":
         lower, upper = torque_limits(spec.torque, f"{where}.torque")
         torque = np.array([np.maximum(torque[0], lower), np.minimum(torque[1], upper)])
-    spheres = []
-    for region in spec.keep_out:
+    spheres: list[tuple[str, Array, float]] = []
+    for k, region in enumerate(spec.keep_out):
         for name in region.points:
-            _index(name, tuple(mechanism.points), f"{where}.keep_out", "point")
+            _index(name, tuple(mechanism.points), f"{where}.keep_out[{k}].points", "point")
             spheres.append((name, np.array(region.sphere.centre), region.sphere.radius))
+    points = [name for name, _, _ in spheres]
+    repeated = len(set(points)) < len(points)
+    sphere_names = tuple(f"distance.{name}.{k + 1}" if repeated else f"distance.{name}"
+                         for k, name in enumerate(points))  # fmt: skip
+    prefixed = [f"{kind}.{x}" for kind, members in (("v", names), ("a", names), ("speed", motors.names),
+                ("tau", motors.names), ("power", motors.names)) for x in members]  # fmt: skip
     return MotionLimits(
         q=q,
         rate=_by_name(spec.rate, names, mechanism.independent, f"{where}.rate", "coordinate"),
         acceleration=_by_name(spec.acceleration, names, mechanism.independent, f"{where}.acceleration", "coordinate"),
         torque=torque,
         speed=np.array(motors.speed_limit),
+        power=_by_name(spec.power, motors.names, motors.names, f"{where}.power", "motor"),
+        jerk=_by_name(spec.jerk, mechanism.independent, mechanism.independent, f"{where}.jerk", "coordinate"),
         torque_rate=_by_name(spec.torque_rate, motors.names, motors.names, f"{where}.torque_rate", "motor"),
         time=np.inf if spec.time is None else spec.time,
         singularity=spec.singularity or 0.0,
         spheres=tuple(spheres),
+        sphere_names=sphere_names,
+        names=(*names, *prefixed, *sphere_names),
     )
 
 

@@ -64,6 +64,13 @@ class InstantsFunction:
             result_sizes=[function.numel_out(k) for k in range(function.n_out())],
         )  # fmt: skip
 
+    @classmethod
+    def of(cls, inputs: list[Any], outputs: list[Any]) -> InstantsFunction:
+        """Return the function with CasADi expressions as outputs, which become dense."""
+        import casadi as cs
+
+        return cls(cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True}))
+
     def __call__(self, *columns: Array) -> list[Array]:
         """Return the results at m instants, (m, rows, columns) arrays, from arguments (m, entries)."""
         results = [np.empty((len(columns[0]), rows * size)) for rows, size in self._shapes]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.dynamics.inverse import friction_force
 from ckc_pin.errors import InputError
@@ -29,6 +30,7 @@ from ckc_pin.optimization.point_to_point import plan_between
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
 from ckc_pin.optimization.spec import LimitsSpec, MinimizeSpec, OptimizeSpec, PathSpec, make_spec, read_optimize
 from ckc_pin.optimization.speed_profile import SpeedProfile
+from ckc_pin.scene.arguments import embed_file
 
 __all__ = ["optimize", "optimize_file"]
 
@@ -54,6 +56,7 @@ def optimize(
     path: Mapping[str, Any] | None = None,
     minimize: Mapping[str, float] | None = None,
     limits: Mapping[str, Any] | None = None,
+    desired: Mapping[str, Any] | None = None,
     intervals: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Plan:
@@ -71,6 +74,9 @@ def optimize(
         ``{"point": {"tip": [[0.1, -0.4, 0.0], [0.2, -0.4, 0.0]]}}``.
     minimize, limits : mapping, optional
         The keys of ``[minimize]`` and ``[limits]``: ``{"time": 1.0}``, ``{"torque": 3.0, "rate": 5.0}``.
+    desired : mapping, optional
+        The motion that ``minimize["tracking"]`` refers to: ``{"file": {"t": t, "theta_1": x, "theta_3": y}}``, or the
+        other keys of a tracking controller's ``desired``.
     intervals : int, optional
         Intervals of the grid.
     progress : callable, optional
@@ -86,20 +92,24 @@ def optimize(
     mechanism = as_mechanism(mechanism, "optimize")
     require_callable(progress, "optimize: progress", "a function of the fraction", 1)
     data: dict[str, Any] = {"mechanism": mechanism.name}
-    for name, table in (("from", start), ("to", to), ("path", path), ("minimize", minimize), ("limits", limits)):
+    for name, table in (("from", start), ("to", to), ("path", path), ("minimize", minimize), ("limits", limits),
+                        ("desired", desired)):  # fmt: skip
         if table is not None:
             require_table(table, f"optimize: {name}", f"a table with the keys of [{name}]")
             data[name] = _to_data(table)
     if intervals is not None:
         data["intervals"] = intervals
-    return _optimize(mechanism, make_spec(data, "optimize"), progress or (lambda fraction: None))
+    texts: dict[str, str] = {}
+    embed_file(data.get("desired"), "desired.csv", texts, "optimize: desired.file", reads_paths=True)
+    sources = Sources("optimize", None, texts)
+    return _optimize(mechanism, make_spec(data, sources.name), sources, progress or (lambda fraction: None))
 
 
 def optimize_file(path: str | Path, progress: Callable[[float], None] | None = None) -> Plan:
     """Plan the motion that a file describes; errors as of `optimize`."""
-    spec, _ = read_optimize(path)
+    spec, sources = read_optimize(path)
     mechanism = load_beside(spec.mechanism, Path(path).parent, spec.parameters)
-    return _optimize(mechanism, spec, progress or (lambda fraction: None))
+    return _optimize(mechanism, spec, sources, progress or (lambda fraction: None))
 
 
 def _to_data(value: Any) -> Any:
@@ -111,7 +121,7 @@ def _to_data(value: Any) -> Any:
     return [_to_data(x) for x in value] if isinstance(value, list | tuple) else value
 
 
-def _optimize(mechanism: Mechanism, spec: OptimizeSpec, progress: Callable[[float], None]) -> Plan:
+def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progress: Callable[[float], None]) -> Plan:
     mechanism.refuse_prescribed_joints("optimize")
     if not mechanism.d:
         raise InputError(f"optimize: {mechanism.name} has no freedoms, so that nothing moves")
@@ -120,7 +130,7 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, progress: Callable[[floa
     limits = make_limits(spec.limits, mechanism)
     with one_blas_thread():
         if spec.path is None:
-            return plan_between(mechanism, spec, limits, progress)
+            return plan_between(mechanism, spec, limits, sources, progress)
         return _along_path(mechanism, spec, spec.path, limits)
 
 
@@ -136,13 +146,13 @@ def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limit
             f"optimize: infeasible: limits.time = {limits.time:g} s: the fastest motion takes {t_end:.6g} s"
         )
     t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2))
-    quantities, margin = measure(dynamics, at)
+    quantities, margin = measure(dynamics, limits, at)
     replay = replay_plan(dynamics, motion, t, torque, at.q_tree)
     return Plan(
         mechanism=mechanism, status="solved", message="the fastest motion along the path", t_end=t_end,
         cost=t_end * spec.minimize.time, parts={"time": t_end}, iterations=sweeps, motion=motion, torque_t=t,
         torque=torque, t=t, quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, mechanism, t, quantities, margin)), replay=replay, warnings=path.warnings,
+        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=path.warnings,
     )  # fmt: skip
 
 
@@ -196,7 +206,7 @@ def _exceeds_inside(
     at = np.arange(len(corners) - 1) if which is None else np.flatnonzero(which)
     t = corners[at, None] + np.diff(corners)[at, None] * inside
     instants, missing = _instants(dynamics, motion, t.ravel(), limits)
-    excess = limits.excess(measure(dynamics, instants)[0]).max(axis=1)
+    excess = limits.excess(measure(dynamics, limits, instants)[0]).max(axis=1)
     exceeded = np.zeros(len(corners) - 1, dtype=bool)
     exceeded[at] = ((excess > 0) | (missing > FORCE_TOLERANCE)).reshape(t.shape).any(axis=1)
     return exceeded
@@ -247,14 +257,14 @@ def _torque_table(
 
 
 def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec) -> None:
-    other = [name for name in ("effort", "jerk", "peak_torque") if getattr(minimize, name)]
+    other = [name for name in ("effort", "energy", "jerk", "peak_torque", "tracking") if getattr(minimize, name)]
     if other:
         raise InputError(
             f"optimize: minimize.{other[0]}: a motion along a path is time-optimal; remove it, or give `to` instead"
         )
     if not minimize.time:
         raise InputError("optimize: minimize.time: expected a weight above zero")
-    for name in ("torque_rate", "keep_out"):
+    for name in ("torque_rate", "keep_out", "power", "jerk"):
         if getattr(limits, name):
             raise InputError(f"optimize: limits.{name}: not supported along a path; remove it")
 

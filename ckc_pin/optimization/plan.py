@@ -14,7 +14,7 @@ from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
 from ckc_pin.base.tables import to_csv_text, to_data_frame
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.optimization.limits import MotionLimits, quantity_names
+from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
 from ckc_pin.run.columns import list_quantities
 from ckc_pin.run.simulate import simulate
@@ -96,7 +96,7 @@ class Plan(HasSummary):
     torque_t, torque : (k,) and (k, motors) arrays
         Motor torques, linear between the rows.
     t, quantities : (m,) and (m, names) arrays
-        Coordinates, rates, accelerations, shaft speeds and torques at instants.
+        Quantities of `limits.names` at instants.
     margin : (m,) array
         Smallest singular value of phi_z, relative to the start; 1 without loops.
     limits : MotionLimits
@@ -125,8 +125,8 @@ class Plan(HasSummary):
 
     def columns(self) -> dict[str, Array]:
         """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
-        named = dict(zip(quantity_names(self.mechanism), self.quantities.T, strict=True))
-        return {name: x for name, x in named.items() if not name.startswith("speed.")}
+        named = zip(self.limits.names, self.quantities.T, strict=True)
+        return {name: x for name, x in named if name.split(".")[0] not in ("speed", "power", "distance")}
 
     def scene(self, control: str = "open") -> Scene:
         """Return a scene that replays the plan.
@@ -252,31 +252,29 @@ def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, t
     q_tree : (m, nq) array
         Closed configurations of the plan.
     """
-    mechanism = dynamics.mechanism
+    mechanism, at = dynamics.mechanism, dynamics.mechanism.partition.q
     run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque), "open"))
     q, rates, _ = motion(motion.corners[-1:])
-    at = mechanism.partition.q
     error = max(np.abs(run.q_tree[-1, at] - q[0]).max(), np.abs(run.v_tree[-1, at] - rates[0]).max())
     closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
     return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
 
 
-def measure(dynamics: ReducedDynamics, at: MotionInstants) -> tuple[Array, Array]:
-    """Return the quantities of `quantity_names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
+def measure(dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants) -> tuple[Array, Array]:
+    """Return the quantities of `limits.names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
     mechanism = dynamics.mechanism
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
-    shafts = at.v_tree @ mechanism.motors.transmission.T
-    return np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau]), dynamics.margins(at.q_tree)
+    shafts, distances = at.v_tree @ mechanism.motors.transmission.T, dynamics.distances(at.q_tree, limits.spheres)
+    quantities = np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, shafts * at.tau, distances])
+    return quantities, dynamics.margins(at.q_tree)
 
 
-def find_active(
-    limits: MotionLimits, mechanism: Mechanism, t: Array, quantities: Array, margin: Array
-) -> list[ActiveLimit]:
+def find_active(limits: MotionLimits, t: Array, quantities: Array, margin: Array) -> list[ActiveLimit]:
     """List the limits that quantities reach, each from one time to another, in the order of these times."""
     lower, upper = limits.bounds()
     size = np.where(np.isfinite(upper) & np.isfinite(lower), upper - lower, np.maximum(np.abs(quantities).max(0), 1e-9))
     reached: list[ActiveLimit] = []
-    names = quantity_names(mechanism)
+    names = limits.names
     sides = [
         ("lower", quantities - lower <= ACTIVE_FRACTION * size / 2),
         ("upper", upper - quantities <= ACTIVE_FRACTION * size / 2),

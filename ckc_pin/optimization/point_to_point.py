@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.base.arrays import Array, BoolArray, Immutable
+from ckc_pin.base.sources import Sources
 from ckc_pin.control.piecewise import PiecewisePolynomial
+from ckc_pin.control.point_path import make_desired
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.point import Point
@@ -16,8 +19,11 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
-from ckc_pin.optimization.collocation import DEGREE, Collocation, Ends, Guess, Solution, gauss_points
-from ckc_pin.optimization.limits import MotionLimits, quantity_names
+from ckc_pin.optimization.collocation import TOLERANCE, Collocation
+from ckc_pin.optimization.dry_friction import FrictionKnots
+from ckc_pin.optimization.ipopt import Ipopt
+from ckc_pin.optimization.limits import MotionLimits
+from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
 from ckc_pin.optimization.path import CoordinatePath, PathMotion
 from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
@@ -26,14 +32,15 @@ from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
 __all__ = ["plan_between"]
 
 FIRST_INTERVALS = 40
-MAX_MESHES = 4  # each has twice the intervals of the one before
+MAX_MESHES = 16
+MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others are where limits are exceeded
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
 VIA_ATTEMPTS = 60  # of paths through another configuration
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
-EXCESS = 1e-3  # relative: a limit that is exceeded by more between the points of the mesh is reported
+EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +53,9 @@ class EndState(Immutable):
 
 
 def plan_between(
-    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, progress: Callable[[float], None]
-) -> Plan:
+    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, sources: Sources,
+    progress: Callable[[float], None],
+) -> Plan:  # fmt: skip
     """Plan a motion from one configuration to another.
 
     Raises
@@ -58,31 +66,72 @@ def plan_between(
         No motion fulfils the limits, or the optimizer does not find one.
     """
     assert spec.to is not None
-    _refuse(mechanism, spec, limits)
-    start = _resolve(mechanism, spec.start, mechanism.assembled, "from")
-    end = _resolve(mechanism, spec.to, start.at, "to")
+    refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
+    start = resolve_state(mechanism, spec.start, mechanism.assembled, "from")
+    end = resolve_state(mechanism, spec.to, start.at, "to")
     for state, name in ((start, "from"), (end, "to")):
-        _require_inside(mechanism, limits, state, name)
+        require_inside(mechanism, limits, state, name)
     dynamics = ReducedDynamics(mechanism)
+    _require_regular(dynamics, limits, start, end)
+    desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
     motion = _guess_motion(dynamics, spec.minimize, limits, start, end)
-    mesh = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
+    mesh = base = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
     torque: Callable[[Array], Array] | None = None
-    iterations = 0
+    iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
     for attempt in range(MAX_MESHES):
-        guess = _sample(dynamics, limits, motion, mesh, start, torque)
-        problem = Collocation(dynamics, limits, spec.minimize, ends, guess)
-        solution = problem.solve(iterations=MAX_ITERATIONS, warm=torque is not None)
+        guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque)
+        friction.begin_mesh(guess.q_tree, motion(guess.duration * gauss_places(mesh))[1])
+        problem = Collocation(dynamics, limits, spec.minimize, guess, start.at.q_tree,
+                              fixed_duration=desired is not None)  # fmt: skip
+        problem.set_ends(ends, None if desired is None else desired(limits.time * gauss_places(mesh)))
+        optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
+        solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
         _require_solved(solution, limits)
-        plan = _assemble(dynamics, spec, limits, solution, iterations, start)
+        friction.end_mesh()
+        plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
         progress((attempt + 1) / MAX_MESHES)
-        if plan.replay.error <= REPLAY_ERROR:
-            break
-        motion, table = plan.motion, (plan.torque_t, plan.torque)
-        torque = _interpolation(*table)
-        mesh = np.sort(np.concatenate([mesh, (mesh[1:] + mesh[:-1]) / 2]))
-    return plan
+        misses = plan.replay.error > REPLAY_ERROR
+        halves = misses and not friction.is_present and doublings < MAX_DOUBLINGS
+        moves = friction.is_smoothed or (friction.is_present and misses)
+        if not halves and not moves and not exceeded.intervals.any():
+            return plan
+        doublings += halves
+        if exceeded.intervals.any() or halves:
+            base = _divide(mesh, exceeded.intervals | halves)
+        mesh = friction.insert(base, plan)
+        motion, torque = plan.motion, _interpolation(plan.torque_t, plan.torque)
+    if not exceeded.intervals.any():
+        return plan
+    raise NumericalError(
+        f"optimize: budget: after {MAX_MESHES} meshes, {exceeded.name} still exceeds its limit by {exceeded.size:.1%} "
+        "between the points of the mesh; give more intervals, or a wider limit"
+    )
+
+
+def gauss_places(mesh: Array) -> Array:
+    """Return the Gauss points of a mesh from 0 to 1."""
+    return np.asarray((mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel())
+
+
+def read_desired_motion(
+    table: dict[str, Any], mechanism: Mechanism, sources: Sources, t_end: float
+) -> Callable[[Array], Array]:
+    """Return the function that gives desired independent coordinates (m, d) at times (m,) (InputError)."""
+    try:
+        desired = make_desired(table, mechanism, sources, t_end)
+    except InputError as error:
+        raise InputError(str(error).replace("controller.desired", "desired")) from None
+    return lambda t: np.array([desired(x)[0] for x in t.tolist()])
+
+
+def _divide(mesh: Array, intervals: BoolArray) -> Array:
+    """Return a mesh with intervals and their neighbours halved."""
+    halved = intervals.copy()
+    halved[1:] |= intervals[:-1]
+    halved[:-1] |= intervals[1:]
+    return np.sort(np.concatenate([mesh, ((mesh[1:] + mesh[:-1]) / 2)[halved]]))
 
 
 def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
@@ -92,20 +141,20 @@ def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
 # --- ends ----------------------------------------------------------------------------------------
 
 
-def _refuse(mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits) -> None:
-    """Refuse keys of the file that a motion between configurations does not support."""
-    rubbing = [name for name, x in zip(mechanism.coordinates, mechanism.joints.friction, strict=True) if x]
-    if rubbing:
-        raise InputError(
-            f"optimize: dry friction of {', '.join(rubbing)} is supported along a path only; set it to 0, as "
-            f'parameters = {{"joint.{rubbing[0]}.friction" = 0.0}}'
-        )
-    for name in ("singularity", "keep_out"):
-        if getattr(spec.limits, name):
-            raise InputError(f"optimize: limits.{name} is supported along a path only; remove it")
-    minimize = spec.minimize
-    if not any((minimize.time, minimize.effort, minimize.jerk, minimize.peak_torque)):
+def refuse_unsupported(
+    mechanism: Mechanism, minimize: MinimizeSpec, limits: MotionLimits, desired: dict[str, Any] | None
+) -> None:
+    """Refuse what a motion between configurations does not support, and a problem without a solution."""
+    if not any(getattr(minimize, name) for name in minimize.__struct_fields__):
         raise InputError("optimize: minimize: every weight is zero; give one above zero, as time = 1.0")
+    if bool(minimize.tracking) != (desired is not None):
+        present, missing = ("desired", "minimize.tracking") if desired else ("minimize.tracking", "desired")
+        raise InputError(f"optimize: {present} needs {missing}; give both or none")
+    if minimize.tracking and (minimize.time or not np.isfinite(limits.time)):
+        raise InputError(
+            "optimize: minimize.tracking: the duration is limits.time; "
+            + ("remove minimize.time" if minimize.time else "give it")
+        )
     if not minimize.time and not np.isfinite(limits.time):
         raise InputError(
             "optimize: minimize: without a weight of time the duration has no bound; give limits.time, or minimize.time"
@@ -114,12 +163,16 @@ def _refuse(mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits) -> N
         raise InputError(f"optimize: {mechanism.name} has no motors; add [[motor]] or actuated to the mechanism's file")
     if (
         minimize.time
-        and not np.isfinite(np.concatenate([limits.torque.ravel(), limits.rate, limits.acceleration])).any()
+        and not np.isfinite(
+            np.concatenate(
+                [limits.torque.ravel(), limits.rate, limits.acceleration, limits.jerk, limits.power, limits.speed]
+            )
+        ).any()
     ):
         raise InputError("optimize: limits: nothing limits the speed; give torque, rate or acceleration")
 
 
-def _resolve(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, name: str) -> EndState:
+def resolve_state(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, name: str) -> EndState:
     """Return the configuration that a table describes, on a branch (InputError)."""
     where = f"optimize: {name}"
     ways = [key for key in ("q", "point", "at") if getattr(spec, key) is not None]
@@ -146,7 +199,7 @@ def _resolve(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, name: st
     return EndState(solution.at, q, rates)
 
 
-def _require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
+def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
     numbers = mechanism.tree.to_coordinates(state.at.q_tree)
     beyond = np.maximum(limits.q[0] - numbers, numbers - limits.q[1])
     k = int(np.argmax(beyond))
@@ -155,12 +208,28 @@ def _require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState,
             f"optimize: {name}: {mechanism.coordinates[k]} = {numbers[k]:.4g} is outside its limits "
             f"[{limits.q[0, k]:.4g}, {limits.q[1, k]:.4g}]; change it or limits.q"
         )
+    distances = mechanism.point_positions(state.at.q_tree)
+    for point, centre, radius in limits.spheres:
+        if (distance := float(np.linalg.norm(distances[point] - centre))) < radius * (1 - 1e-9):
+            raise InputError(
+                f"optimize: {name}: the point {point!r} is {distance:.4g} m from the centre of a sphere of "
+                f"limits.keep_out with radius {radius:g} m; change it or the sphere"
+            )
     fast = np.abs(state.rates) > limits.rate[mechanism.partition.q]
     if fast.any():
         k = int(np.argmax(fast))
         raise InputError(
             f"optimize: {name}.q_dot: {mechanism.independent[k]} = {state.rates[k]:.4g} is above limits.rate = "
             f"{limits.rate[mechanism.partition.q[k]]:g}"
+        )
+
+
+def _require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+    margin = dynamics.margins(np.array([start.at.q_tree, end.at.q_tree]))[1]
+    if margin < limits.singularity:
+        raise InputError(
+            f"optimize: to: sigma_min(phi_z) is {margin:.3g} of its value at the start, below limits.singularity = "
+            f"{limits.singularity:g}; change one of them"
         )
 
 
@@ -264,17 +333,19 @@ class Slowed:
         return q, v * factor, a * factor**2
 
 
-def _sample(
-    dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Array, start: EndState,
+def sample_motion(
+    dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Array, start: Array,
     torque: Callable[[Array], Array] | None,
 ) -> Guess:  # fmt: skip
-    """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics."""
+    """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics.
+
+    The loops are followed from the closed configuration `start` (nq,).
+    """
     duration = float(motion.corners[-1])
-    points = (mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel()
-    t = duration * np.sort(np.concatenate([mesh, points]))
+    t = duration * np.sort(np.concatenate([mesh, gauss_places(mesh)]))
     is_knot = np.isin(np.arange(len(t)), np.arange(0, len(t), DEGREE + 1))
     q, v, a = motion(t)
-    q_tree = dynamics.follow(start.at.q_tree, q)
+    q_tree = dynamics.follow(start, q)
     if q_tree is None:
         raise NumericalError("optimize: stuck: the loops do not close along the initial guess")
     knots = q_tree[is_knot]
@@ -311,14 +382,18 @@ def _require_solved(solution: Solution, limits: MotionLimits) -> None:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Exceeded(Immutable):
+    """Intervals in which limits are exceeded by more than `EXCESS`, and the worst quantity with its relative excess."""
+
+    intervals: BoolArray
+    name: str
+    size: float
+
+
 def _assemble(
-    dynamics: ReducedDynamics,
-    spec: OptimizeSpec,
-    limits: MotionLimits,
-    solution: Solution,
-    iterations: int,
-    start: EndState,
-) -> Plan:
+    dynamics: ReducedDynamics, limits: MotionLimits, solution: Solution, iterations: int, start: EndState
+) -> tuple[Plan, Exceeded]:
     mechanism, values = dynamics.mechanism, solution.values
     motion = solution.motion()
     torque = np.clip(values.torque, *limits.torque)
@@ -332,21 +407,33 @@ def _assemble(
             "optimize: stuck: the loops do not close between the points of the mesh; give more intervals"
         )
     at = dynamics.instants(q_tree, v, a, _interpolation(knots, torque)(t))
-    quantities, margin = measure(dynamics, at)
-    warnings = list(_excess_warnings(limits, mechanism, quantities))
+    quantities, margin = measure(dynamics, limits, at)
     replay = replay_plan(dynamics, motion, knots, torque, q_tree)
+    warnings = []
     if replay.error > REPLAY_ERROR:
-        warnings.append(f"the replay misses the end by {replay.error:.1e}; give more intervals")
-    return Plan(
+        remedy = "give more intervals"
+        if mechanism.joints.friction.any():
+            remedy = "joints with dry friction may stick, which the plan does not foresee; track the motion"
+        warnings.append(f"the replay misses the end by {replay.error:.1e}; {remedy}")
+    plan = Plan(
         mechanism=mechanism, status="solved", message="a local optimum", t_end=values.duration, cost=solution.cost,
         parts=solution.parts, iterations=iterations, motion=motion, torque_t=knots, torque=torque, t=t,
         quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, mechanism, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
+        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
     )  # fmt: skip
+    return plan, _find_excess(limits, quantities, margin)
 
 
-def _excess_warnings(limits: MotionLimits, mechanism: Mechanism, quantities: Array) -> list[str]:
-    excess = limits.excess(quantities).max(axis=0) / np.maximum(np.abs(quantities).max(axis=0), 1e-12)
-    names = quantity_names(mechanism)
-    return [f"{names[k]} exceeds its limit by {excess[k]:.1%} between the points of the mesh; give more intervals"
-            for k in np.flatnonzero(excess > EXCESS)]  # fmt: skip
+def _find_excess(limits: MotionLimits, quantities: Array, margin: Array) -> Exceeded:
+    """Find the intervals in which limits are exceeded, from samples of them and of the end."""
+    size = np.maximum(np.abs(quantities).max(axis=0), 1e-12)
+    if limits.spheres:
+        size[-len(limits.spheres) :] = [radius for _, _, radius in limits.spheres]
+    relative = limits.excess(quantities) / size
+    close = 1 - margin[:, None] / limits.singularity if limits.singularity else np.zeros((len(margin), 0))
+    relative = np.hstack([relative, close])
+    at = relative > EXCESS
+    inside: BoolArray = np.asarray(at[:-1].reshape(-1, SAMPLES_PER_INTERVAL * at.shape[1]).any(axis=1))
+    inside[-1] |= at[-1].any()
+    worst = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    return Exceeded(inside, (*limits.names, "sigma_min")[int(worst[1])], float(relative[worst]))

@@ -7,6 +7,7 @@ follow from the implicit function theorem.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -73,6 +74,14 @@ class ReducedDynamics:
     ----------
     mechanism : Mechanism
 
+    Attributes
+    ----------
+    slip : float
+        Dry friction is friction v / sqrt(v^2 + slip^2), with slip in rad/s, or sizes of the mechanism per second. 0:
+        there is none, or that of `directions`.
+    directions : (m, n) array, optional
+        Signs of the rates that dry friction opposes at the instants of a motion.
+
     Raises
     ------
     InputError
@@ -89,7 +98,8 @@ class ReducedDynamics:
         if of_root:
             raise InputError(f"optimize: {of_root[0]} belongs to a free root; choose independent coordinates of joints")
         self.mechanism, self.d, self.n = mechanism, mechanism.d, mechanism.n
-        self.motors = len(mechanism.motors.names)
+        self.motors, self.slip = len(mechanism.motors.names), 0.0
+        self.directions: Array | None = None
         self.q_at, self.z_at = mechanism.partition.q, mechanism.partition.z
         self.q_in_tree = tree.q_index[self.q_at]
         self.z_in_tree = np.setdiff1d(np.arange(tree.nq), self.q_in_tree)
@@ -111,10 +121,17 @@ class ReducedDynamics:
         passive = substitute(terms.inverse_dynamics - terms.damping)
         balance = passive - cs.mtimes(transmission.T, tau) - cs.mtimes(J.T, multipliers)
         self._symbols = q, v, a, multipliers
+        self.state_symbols = q, v, a, tau
+        self.phi_z = J[:, self.z_at.tolist()]
+        self.points = substitute(terms.points[0])
         self._rows = phi, cs.mtimes(J, v), acceleration, balance
-        self._closure = _function([q], [phi, cs.jacobian(phi, q)])
-        self._rates = _function([q, v], [J, J_dot_v])
-        self._passive = _function([q, v, a], [passive])
+        self._closure = InstantsFunction.of([q], [phi, cs.jacobian(phi, q)])
+        self._rates = InstantsFunction.of([q, v], [J, J_dot_v])
+        self._passive = InstantsFunction.of([q, v, a], [passive])
+
+    @cached_property
+    def _points(self) -> InstantsFunction:
+        return InstantsFunction.of([self.state_symbols[0]], [self.points])
 
     @cached_property
     def _first(self) -> InstantsFunction:
@@ -124,7 +141,7 @@ class ReducedDynamics:
         (q, v, a, _), (phi, rate, acceleration, balance) = self._symbols, self._rows
         by = ((phi, q), (rate, v), (rate, q), (acceleration, q), (acceleration, v), (balance, q), (balance, v),
               (balance, a))  # fmt: skip
-        return _function(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
+        return InstantsFunction.of(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
 
     @cached_property
     def _second(self) -> InstantsFunction:
@@ -136,7 +153,7 @@ class ReducedDynamics:
         lagrangian = sum(cs.dot(w, x) for w, x in zip(weights, self._rows, strict=True))
         by_q, by_v = cs.gradient(lagrangian, q), cs.gradient(lagrangian, v)
         pairs = ((by_q, q), (by_q, v), (by_v, v), (by_q, a), (by_q, multipliers))
-        return _function([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
+        return InstantsFunction.of([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
 
     # --- values ----------------------------------------------------------------------------------
 
@@ -227,13 +244,26 @@ class ReducedDynamics:
         rho[:, self.z_at] = -inverse @ J[:, :, self.q_at]
         return rho
 
-    def margins(self, q_tree: Array) -> Array:
-        """Return smallest singular values of phi_z at configurations, relative to the first; 1 without loops."""
+    def smallest_singular_values(self, q_tree: Array) -> Array:
+        """Return smallest singular values of phi_z at configurations (m, nq); 1 without loops."""
         if not len(self.z_at):
             return np.ones(len(q_tree))
         J, _ = self._rates(q_tree, np.zeros((len(q_tree), self.n)))
-        smallest = np.linalg.svd(J[:, :, self.z_at], compute_uv=False)[:, -1]
+        return np.asarray(np.linalg.svd(J[:, :, self.z_at], compute_uv=False)[:, -1], dtype=float)
+
+    def margins(self, q_tree: Array) -> Array:
+        """Return smallest singular values of phi_z at configurations, relative to the first; 1 without loops."""
+        smallest = self.smallest_singular_values(q_tree)
         return smallest / smallest[0]
+
+    def distances(self, q_tree: Array, spheres: Sequence[tuple[str, Array, float]]) -> Array:
+        """Return the distances of points from centres at configurations, (m, spheres)."""
+        if not spheres:
+            return np.zeros((len(q_tree), 0))
+        positions = self._points(q_tree)[0].reshape(len(q_tree), -1, 3)
+        names = list(self.mechanism.points)
+        return np.array([np.linalg.norm(positions[:, names.index(name)] - centre, axis=1)
+                         for name, centre, _ in spheres]).T  # fmt: skip
 
     def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
         """Return a motion at closed configurations with rates and accelerations (m, d) and torques (m, motors)."""
@@ -245,10 +275,22 @@ class ReducedDynamics:
         _, J_dot_v = self._rates(q_tree, v_tree)
         a_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], a) + J_dot_v[:, :, 0])
         (passive,) = self._passive(q_tree, v_tree, a_tree)
-        force = passive[:, :, 0] - tau @ self.mechanism.motors.transmission
+        force = passive[:, :, 0] + self._friction(v_tree)[0] - tau @ self.mechanism.motors.transmission
         multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
         missing = force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
         return MotionInstants(q_tree, v_tree, a_tree, multipliers, tau, missing)
+
+    def _friction(self, v_tree: Array) -> Array:
+        """Return the forces that dry friction takes, and two derivatives by the rates, (3, m, n)."""
+        if not self.slip:
+            forces = np.zeros((3, *v_tree.shape))
+            if self.directions is not None:
+                forces[0] = self.directions * self.mechanism.joints.friction
+            return forces
+        slip = self.slip * self.mechanism.tree.step_scale
+        square = v_tree**2 + slip**2
+        sign = np.array([v_tree / square**0.5, slip**2 / square**1.5, -3 * slip**2 * v_tree / square**2.5])
+        return sign * self.mechanism.joints.friction
 
     # --- derivatives -----------------------------------------------------------------------------
 
@@ -257,6 +299,7 @@ class ReducedDynamics:
         m, d, n, q_at, z_at = len(at.q_tree), self.d, self.n, self.q_at, self.z_at
         blocks = self._first(at.q_tree, at.v_tree, at.a_tree, at.multipliers)
         phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = blocks
+        balance_v[:, np.arange(n), np.arange(n)] += self._friction(at.v_tree)[1]
         size = 3 * d + self.motors
         inverse, J_q = _inverse(J[:, :, z_at]), J[:, :, q_at]
         q_tree = np.zeros((m, self.mechanism.tree.nq, size))
@@ -274,43 +317,44 @@ class ReducedDynamics:
         force = balance[:, q_at] - J_q.transpose(0, 2, 1) @ multipliers
         return Derivatives(q_tree, v_tree, a_tree, multipliers, force, tuple(blocks))
 
+    def state_derivatives(self, by_x: Derivatives) -> Array:
+        """Return the derivatives of the state (q', v', dv'/dt, tau) of each instant, (m, nq + 2 n + motors, size)."""
+        tau = np.zeros((len(by_x.q_tree), self.motors, by_x.q_tree.shape[2]))
+        tau[:, np.arange(self.motors), 3 * self.d + np.arange(self.motors)] = 1.0
+        return np.concatenate([by_x.q_tree, by_x.v_tree, by_x.a_tree, tau], axis=1)
+
     def hessian(
-        self, at: MotionInstants, by_x: Derivatives, weights: Array, q_weights: Array | None = None,
-        v_weights: Array | None = None,
-    ) -> Array:  # fmt: skip
+        self, at: MotionInstants, by_x: Derivatives, weights: Array, state_weights: Array | None = None
+    ) -> Array:
         """Return the second derivatives of weights (m, d) times the missing force, (m, 3 d + motors, 3 d + motors).
 
         Parameters
         ----------
-        q_weights : (m, nq) array, optional
-            The result includes the second derivatives of these weights times the configuration.
-        v_weights : (m, n) array, optional
-            The same of the rates v'.
+        state_weights : (m, nq + 2 n + motors) array, optional
+            The result includes the second derivatives of these weights times the state (q', v', dv'/dt, tau).
         """
         z_at = self.z_at
         phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = by_x.blocks
         inverse = _inverse(J[:, :, z_at])
         w_balance = _times(self._rho(J, inverse), weights)
         to_rows = inverse.transpose(0, 2, 1)
-        w_acceleration = -_times(to_rows, _transposed(balance_a, w_balance)[:, z_at])
-        by_v = _transposed(balance_v, w_balance) + _transposed(acc_v, w_acceleration)
-        w_rate = -_times(to_rows, (by_v if v_weights is None else by_v + v_weights)[:, z_at])
+        nq, n = self.mechanism.tree.nq, self.n
+        extra = np.zeros((len(weights), nq + 2 * n + self.motors)) if state_weights is None else state_weights
+        by_a = _transposed(balance_a, w_balance) + extra[:, nq + n : nq + 2 * n]
+        w_acceleration = -_times(to_rows, by_a[:, z_at])
+        by_v = _transposed(balance_v, w_balance) + _transposed(acc_v, w_acceleration) + extra[:, nq : nq + n]
+        w_rate = -_times(to_rows, by_v[:, z_at])
         by_q = _transposed(balance_q, w_balance) + _transposed(acc_q, w_acceleration) + _transposed(rate_q, w_rate)
-        by_q = by_q if q_weights is None else by_q + q_weights
+        by_q += extra[:, :nq]
         inverse_q = _inverse(phi_q[:, :, self.z_in_tree])
         w_phi = -_times(inverse_q.transpose(0, 2, 1), by_q[:, self.z_in_tree])
         qq, qv, vv, qa, ql = self._second(
             at.q_tree, at.v_tree, at.a_tree, at.multipliers, w_phi, w_rate, w_acceleration, w_balance
         )
+        vv[:, np.arange(n), np.arange(n)] += w_balance * self._friction(at.v_tree)[2]
         mixed = qq @ by_x.q_tree / 2 + qv @ by_x.v_tree + qa @ by_x.a_tree + ql @ by_x.multipliers
         half = by_x.q_tree.transpose(0, 2, 1) @ mixed + by_x.v_tree.transpose(0, 2, 1) @ (vv @ by_x.v_tree) / 2
         return half + half.transpose(0, 2, 1)
-
-
-def _function(inputs: list[Any], outputs: list[Any]) -> InstantsFunction:
-    import casadi as cs
-
-    return InstantsFunction(cs.Function("terms", inputs, [cs.densify(x) for x in outputs], {"cse": True}))
 
 
 def _times(matrices: Array, vectors: Array) -> Array:

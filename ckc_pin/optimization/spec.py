@@ -90,18 +90,28 @@ class MinimizeSpec(FileStruct, frozen=True, kw_only=True):
     effort : 1/(N² m² s)
         Of the integral of the squared motor torques.
         ``effort = 0.1``
+    energy : 1/J
+        Of the positive mechanical work of the motors: what they draw if they cannot store what they brake. Heat of the
+        windings is proportional to effort.
+        ``energy = 0.2``
     jerk : s⁵/rad²
         Of the integral of the squared jerks of the independent coordinates.
         ``jerk = 1e-6``
     peak_torque : 1/(N m)
         Of the largest motor torque.
         ``peak_torque = 0.5``
+    tracking : 1/(rad² s)
+        Of the integral of the squared distance of the independent coordinates from those of ``desired``. The duration
+        is ``limits.time``.
+        ``tracking = 10.0``
     """
 
     time: Weight = 0.0
     effort: Weight = 0.0
+    energy: Weight = 0.0
     jerk: Weight = 0.0
     peak_torque: Weight = 0.0
+    tracking: Weight = 0.0
 
 
 class SphereSpec(FileStruct, frozen=True, kw_only=True):
@@ -158,6 +168,12 @@ class LimitsSpec(FileStruct, frozen=True, kw_only=True):
     acceleration : rad/s², m/s²
         Largest accelerations, as ``rate``.
         ``acceleration = {theta_1 = 20.0}``
+    jerk : rad/s³, m/s³
+        Largest jerks of the independent coordinates, point to point; a table is by coordinate.
+        ``jerk = 500.0``
+    power : W
+        Largest mechanical power of the motors, driving or braking, point to point; a table is by motor.
+        ``power = 200.0``
     time : s
         Longest duration.
         ``time = 1.0``
@@ -174,6 +190,8 @@ class LimitsSpec(FileStruct, frozen=True, kw_only=True):
     q: dict[str, Pair] = {}
     rate: Limit | dict[str, Limit] | None = None
     acceleration: Limit | dict[str, Limit] | None = None
+    jerk: Limit | dict[str, Limit] | None = None
+    power: Limit | dict[str, Limit] | None = None
     time: Limit | None = None
     singularity: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
     keep_out: list[KeepOutSpec] = []
@@ -205,6 +223,9 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
     limits
         Limits of the motion.
         ``limits = {torque = 5.0}``
+    desired
+        The motion that ``minimize.tracking`` refers to, as ``desired`` of a scene's tracking controller.
+        ``desired = {file = "way.csv"}``
     intervals
         Intervals of the grid, of a path 1000 if absent; of a motion from one configuration to another 40 at first.
         ``intervals = 200``
@@ -217,6 +238,7 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
     path: PathSpec | None = None
     minimize: MinimizeSpec = MinimizeSpec(time=1.0)
     limits: LimitsSpec = LimitsSpec()
+    desired: dict[str, Any] | None = None
     intervals: Annotated[int, msgspec.Meta(ge=4, le=20_000)] | None = None
 
 

@@ -13,7 +13,6 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.identification.excitation import Excitation
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.units import joined, motor_units
-from ckc_pin.optimization.limits import quantity_names
 from ckc_pin.optimization.plan import Plan
 from ckc_pin.run.columns import derivative_unit, key_unit
 from ckc_pin.run.motion_forces import MotionForces
@@ -145,7 +144,7 @@ def draw_plan(plan: Plan) -> Figure:
         matplotlib is not installed.
     """
     mechanism, t = plan.mechanism, plan.t
-    bounds = dict(zip(quantity_names(mechanism), zip(*plan.limits.bounds(), strict=True), strict=True))
+    bounds = dict(zip(plan.limits.names, zip(*plan.limits.bounds(), strict=True), strict=True))
     with figure_style():
         title = f"{escape_mathtext(mechanism.name)}: planned motion of {plan.t_end:.4g} s"
         titles = ["motion", "motors", "distance from singularities"]

@@ -13,10 +13,11 @@ import ckc_pin
 from ckc_pin import InputError, NumericalError, optimize
 from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.loading import as_mechanism
-from ckc_pin.optimization.collocation import Collocation, Ends, Guess, gauss_points
+from ckc_pin.optimization.collocation import Collocation
 from ckc_pin.optimization.limits import make_limits
+from ckc_pin.optimization.mesh_motion import Ends, Guess, gauss_points
 from ckc_pin.optimization.reduced import ReducedDynamics
-from ckc_pin.optimization.spec import LimitsSpec, MinimizeSpec
+from ckc_pin.optimization.spec import KeepOutSpec, LimitsSpec, MinimizeSpec, SphereSpec
 from tests.analytic.five_bar import FiveBar
 from tests.optimization.small_models import (
     MASS,
@@ -117,22 +118,38 @@ def test_torque_rate_is_limited() -> None:
     assert np.abs(slopes).max() > 19.9
 
 
-def test_derivatives_of_the_nonlinear_program_are_exact() -> None:
-    five_bar = as_mechanism("five_bar", "test")
-    dynamics, random, count = ReducedDynamics(five_bar), np.random.default_rng(0), 4
-    start, duration = five_bar.independent_part(five_bar.q_tree), 0.5
+EVERY_LIMIT: dict[str, Any] = {
+    "torque": 2.0, "acceleration": 100.0, "torque_rate": 50.0, "jerk": 1e4, "power": 20.0, "singularity": 0.3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "limits"),
+    [
+        ("five_bar", {"q": {"theta_2": [-1.0, 3.0]}, "rate": {"theta_1": 5.0, "theta_4": 9.0},
+                      "keep_out": [KeepOutSpec(sphere=SphereSpec(centre=(0.1, -0.3, 0.0), radius=0.1),
+                                               points=["tip"])]}),
+        ("delta", {"acceleration": {"swing_1a": 20.0}, "q": {"plate_place.z": [-0.5, 0.5]}}),
+        ("slider_crank", {}),
+    ],
+)  # fmt: skip
+def test_derivatives_of_the_nonlinear_program_are_exact(name: str, limits: dict[str, Any]) -> None:
+    mechanism = as_mechanism(name, "test")
+    dynamics, random, count, d = ReducedDynamics(mechanism), np.random.default_rng(0), 4, mechanism.d
+    start, duration, motors = mechanism.independent_part(mechanism.q_tree), 0.5, len(mechanism.motors.names)
     mesh = np.linspace(0.0, 1.0, count + 1)
     points = (mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel()
-    way = np.array([0.3, -0.2])
-    q_tree = dynamics.follow(five_bar.q_tree, start + np.outer(points, way))
+    way = random.uniform(-0.2, 0.2, d)
+    q_tree = dynamics.follow(mechanism.q_tree, start + np.outer(points, way))
     assert q_tree is not None
     guess = Guess(
         mesh, duration, start + np.outer(mesh, way), np.tile(way / duration, (count + 1, 1)),
-        random.normal(size=(count, 3, 2)), random.normal(size=(count + 1, 2)), q_tree,
+        random.normal(size=(count, 3, d)), random.normal(size=(count + 1, motors)), q_tree,
     )  # fmt: skip
-    limits = make_limits(LimitsSpec(torque=2.0, rate=5.0, acceleration=100.0, torque_rate=50.0), five_bar)
-    weights = MinimizeSpec(time=1.0, effort=0.1, jerk=1e-4, peak_torque=0.3)
-    problem = Collocation(dynamics, limits, weights, Ends(np.array([start, start + way]), np.ones((2, 2))), guess)
+    weights = MinimizeSpec(time=1.0, effort=0.1, energy=0.2, jerk=1e-4, peak_torque=0.3, tracking=0.7)
+    problem = Collocation(dynamics, make_limits(LimitsSpec(**EVERY_LIMIT | limits), mechanism), weights, guess,
+                          mechanism.q_tree)  # fmt: skip
+    problem.set_ends(Ends(guess.q[[0, -1]], guess.rates[[0, -1]]), random.normal(size=(3 * count, d)))
     w = problem.pack(guess)
     multipliers = random.normal(size=problem.rows)
 
@@ -200,7 +217,6 @@ def test_weak_motors_swing_the_five_bar_to_a_place_that_they_cannot_reach_direct
         ({"minimize": {"time": 0.0}}, "minimize: every weight is zero"),
         ({"minimize": {"effort": 1.0}}, "without a weight of time the duration has no bound"),
         ({"limits": {"torque": 2.0, "q": {"theta_1": [-1.2, 0.0]}}}, "from: theta_1 = -1.43"),
-        ({"limits": {"torque": 2.0, "singularity": 0.5}}, "limits.singularity is supported along a path only"),
         ({"start": {"at": "assembled", "q_dot": {"theta_1": 5.0}}, "limits": {"torque": 2.0, "rate": 1.0}},
          "from.q_dot: theta_1 = 5 is above limits.rate = 1"),
     ],
@@ -215,8 +231,3 @@ def test_wrong_input_is_explained(change: dict[str, Any], message: str) -> None:
 def test_an_infeasible_duration_is_reported() -> None:
     with pytest.raises(NumericalError, match=r"optimize: (infeasible|stuck|budget): .* largest violation"):
         optimize("five_bar", to=TARGET, limits={"torque": 2.0, "time": 0.02})
-
-
-def test_dry_friction_is_refused_with_a_remedy() -> None:
-    with pytest.raises(InputError, match=r"dry friction of rail .* parameters = \{\"joint\.rail\.friction\" = 0\.0\}"):
-        optimize(slider(friction=0.5), to={"q": {"rail": 0.5}}, limits={"torque": 3.0})

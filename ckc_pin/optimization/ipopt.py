@@ -1,0 +1,164 @@
+"""IPOPT for a nonlinear program whose values and derivatives come from Python functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from ckc_pin.base.arrays import Array, Immutable, IntArray
+
+__all__ = ["Ipopt", "Optimum", "Program", "merge_patterns", "nonzeros"]
+
+CONSTRAINT_TOLERANCE = 1e-9
+WARM_BARRIER = 1e-6  # first barrier parameter of a warm start
+
+
+class Program(Protocol):
+    """Minimize a cost of variables within bounds of the variables and of constraints."""
+
+    size: int
+    rows: int
+    bounds: Array
+    jacobian_pattern: Any
+    hessian_pattern: Any
+
+    def constraints(self, w: Array) -> tuple[float, Array]:
+        """Return the cost and all constraints."""
+
+    def gradient(self, w: Array) -> Array:
+        """Return the gradient of the cost."""
+
+    def jacobian(self, w: Array) -> Array:
+        """Return the nonzeros of the constraints' Jacobian."""
+
+    def hessian(self, w: Array, factor: float, multipliers: Array) -> Array:
+        """Return the nonzeros of the Lagrangian's Hessian, upper triangle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum(Immutable):
+    """Variables, multipliers of their bounds and of the constraints, IPOPT's status, and iterations."""
+
+    w: Array
+    bound_multipliers: Array
+    multipliers: Array
+    status: str
+    iterations: int
+
+
+class Ipopt:
+    """IPOPT on a program.
+
+    Parameters
+    ----------
+    program : Program
+    iterations : int
+        Largest number.
+    tolerance : float
+        Relative to the scaled problem.
+    warm : bool
+        Begin close to a solution.
+    barrier : float, optional
+        First barrier parameter of a warm start.
+    """
+
+    def __init__(
+        self, program: Program, *, iterations: int, tolerance: float, warm: bool, barrier: float = WARM_BARRIER
+    ) -> None:
+        import casadi as cs
+
+        self.program = program
+        n, rows = program.size, program.rows
+        column, none = cs.Sparsity.dense(n, 1), cs.Sparsity(0, 0)
+        one, g = cs.Sparsity.dense(1, 1), cs.Sparsity.dense(rows, 1)
+        jacobian, hessian = program.jacobian_pattern, program.hessian_pattern
+        functions = [
+            _callback("nlp", {"x": column, "p": none}, {"f": one, "g": g}, lambda x: list(program.constraints(x[0]))),
+            _callback("grad_f", {"x": column, "p": none}, {"f": one, "grad_f_x": column},
+                      lambda x: [program.constraints(x[0])[0], program.gradient(x[0])]),
+            _callback("jac_g", {"x": column, "p": none}, {"g": g, "jac_g_x": jacobian},
+                      lambda x: [program.constraints(x[0])[1], program.jacobian(x[0])]),
+            _callback("hess_lag", {"x": column, "p": none, "lam_f": one, "lam_g": g}, {"triu_hess_gamma_x_x": hessian},
+                      lambda x: [program.hessian(x[0], float(x[2][0]), x[3])]),
+        ]  # fmt: skip
+        settings: dict[str, Any] = {
+            "print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance,
+            "constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_tol": 100 * tolerance,
+            "acceptable_constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_iter": 5, "mu_strategy": "adaptive",
+        }  # fmt: skip
+        if warm:
+            settings |= {"warm_start_init_point": "yes", "mu_init": barrier, "mu_strategy": "monotone",
+                         "warm_start_bound_push": 1e-8, "warm_start_mult_bound_push": 1e-8}  # fmt: skip
+        nlp, grad_f, jac_g, hess = functions
+        self._functions = functions
+        self._solver = cs.nlpsol("plan", "ipopt", nlp, {
+            "grad_f": grad_f, "jac_g": jac_g, "hess_lag": hess, "no_nlp_grad": True, "print_time": False,
+            "calc_lam_p": False, "show_eval_warnings": False, "ipopt": settings,
+        })  # fmt: skip
+
+    def solve(self, w: Array, bounds: Array, last: Optimum | None = None) -> Optimum:
+        """Minimize from w, within bounds (2, variables), with the multipliers of a solution nearby."""
+        arguments = {"x0": np.clip(w, *bounds), "lbx": bounds[0], "ubx": bounds[1],
+                     "lbg": self.program.bounds[0], "ubg": self.program.bounds[1]}  # fmt: skip
+        if last is not None:
+            arguments |= {"lam_x0": last.bound_multipliers, "lam_g0": last.multipliers}
+        result = self._solver(**arguments)
+        x, lam_x, lam_g = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+        stats = self._solver.stats()
+        return Optimum(x, lam_x, lam_g, str(stats["return_status"]), int(stats["iter_count"]))
+
+
+def nonzeros(matrix: Any) -> Any:
+    """Return a sparse matrix's nonzeros as a dense column."""
+    import casadi as cs
+
+    return cs.densify(cs.vertcat(*matrix.nonzeros())) if matrix.nnz() else cs.SX(0, 1)
+
+
+def merge_patterns(parts: Sequence[tuple[Any, Any]], rows: int, columns: int) -> tuple[Any, IntArray]:
+    """Return a CasADi sparsity with the entries of several lists of rows and columns, and the place of each entry."""
+    import casadi as cs
+
+    row, column = (np.concatenate([part[k] for part in parts]).astype(np.int64) for k in (0, 1))
+    keys, places = np.unique(column * rows + row, return_inverse=True)
+    starts = np.searchsorted(keys, np.arange(columns + 1) * rows)
+    return cs.Sparsity(rows, columns, starts.tolist(), (keys % rows).tolist()), places
+
+
+def _callback(
+    name: str, inputs: dict[str, Any], outputs: dict[str, Any], evaluate: Callable[[list[Array]], list[Any]]
+) -> Any:
+    """Return a CasADi function that calls a Python function with vectors and takes nonzeros."""
+    import casadi as cs
+
+    class Function(cs.Callback):
+        def __init__(self) -> None:
+            cs.Callback.__init__(self)
+            self.construct(name, {})
+
+        def get_n_in(self) -> int:
+            return len(inputs)
+
+        def get_n_out(self) -> int:
+            return len(outputs)
+
+        def get_name_in(self, k: int) -> str:
+            return list(inputs)[k]
+
+        def get_name_out(self, k: int) -> str:
+            return list(outputs)[k]
+
+        def get_sparsity_in(self, k: int) -> Any:
+            return list(inputs.values())[k]
+
+        def get_sparsity_out(self, k: int) -> Any:
+            return list(outputs.values())[k]
+
+        def eval(self, arguments: Sequence[Any]) -> list[Any]:
+            values = evaluate([x.full().ravel() for x in arguments])
+            return [cs.DM(pattern, x) for pattern, x in zip(outputs.values(), values, strict=True)]
+
+    return Function()
