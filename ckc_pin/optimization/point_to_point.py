@@ -21,6 +21,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
 from ckc_pin.optimization.collocation import TOLERANCE, Collocation
 from ckc_pin.optimization.dry_friction import FrictionKnots
+from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
@@ -37,7 +38,6 @@ MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
-VIA_ATTEMPTS = 60  # of paths through another configuration
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
@@ -240,7 +240,7 @@ def _guess_motion(
     dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
 ) -> CoordinateMotion:
     """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
-    path = _find_path(dynamics, start, end)
+    path = CoordinatePath(search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree, "optimize"))
     at_rest = not start.rates.any() and not end.rates.any()
     moves = np.abs(end.q - start.q).max() > 0
     s = (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2
@@ -262,29 +262,6 @@ def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> f
     if not minimize.time:
         return limits.time
     return min(fastest, limits.time)
-
-
-def _find_path(dynamics: ReducedDynamics, start: EndState, end: EndState) -> CoordinatePath:
-    """Return a path that the loops can follow: the straight line in q, or two lines through another configuration."""
-    mechanism = dynamics.mechanism
-    random = np.random.default_rng(0)
-    scale = mechanism.tree.step_scale[mechanism.partition.q]
-    middle, spread = (start.q + end.q) / 2, np.abs(end.q - start.q) / 2 + 0.5 * scale
-    assembled = mechanism.independent_part(mechanism.q_tree)
-    for attempt in range(VIA_ATTEMPTS):
-        via = [middle, assembled][attempt] if attempt < 2 else middle + spread * random.uniform(-1, 1, dynamics.d)
-        # A quadratic curve through the middle place; the straight line at first.
-        c2 = 2 * (start.q + end.q) - 4 * via
-        c1 = end.q - start.q - c2
-        q = PiecewisePolynomial(np.array([0.0, 1.0]), np.array([c2, c1, start.q])[:, None, :], end=1.0)
-        path = CoordinatePath(q)
-        reached = dynamics.follow(start.at.q_tree, q(np.linspace(0.0, 1.0, GUESS_PLACES + 1))[0])
-        if reached is not None and np.abs(reached[-1] - end.at.q_tree).max() < 1e-6:
-            return path
-    raise NumericalError(
-        f"optimize: stuck: no path of the loops from `from` to `to` was found in {VIA_ATTEMPTS} attempts; a singular "
-        "configuration may separate them. `ckc map` shows the aspects; plan in several parts"
-    )
 
 
 @dataclass(frozen=True, eq=False)
