@@ -17,7 +17,7 @@ from ckc_pin.kinematics.extended import Task, extend_closure
 from ckc_pin.kinematics.nodes import Nodes, follow, nodes_at
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.limits import MotionLimits
-from ckc_pin.optimization.path import round_corners
+from ckc_pin.optimization.path import CoordinatePath, round_corners
 
 __all__ = ["FreeSpace", "search_path"]
 
@@ -84,20 +84,6 @@ class FreeSpace:
             columns.append(self._sigma(nodes)[:, None] - self._min_sigma)
         return np.hstack(columns)
 
-    def describe_violation(self, node: Nodes) -> str:
-        """Return the limit that a configuration violates most, in words; "" if there is none."""
-        distances = self.distances(node)[0]
-        if distances.min(initial=0.0) >= -LIMIT_TOLERANCE:
-            return ""
-        k = int(np.argmin(distances))
-        if k < len(self._limited):
-            return f"{self.mechanism.coordinates[self._limited[k]]} is outside its limits"
-        if k == len(self._limited) + len(self.limits.spheres):
-            return "it is nearer to a singular configuration than limits.singularity"
-        point, centre, radius = self.limits.spheres[k - len(self._limited)]
-        at = ", ".join(f"{x:g}" for x in centre)
-        return f"the point {point!r} is inside the sphere of limits.keep_out at ({at}) with the radius {radius:g}"
-
     def length(self, step: Array) -> Array:
         """Return the lengths of steps of q (..., d), in rad or sizes of the mechanism."""
         return np.linalg.norm(step / self.scale, axis=-1)
@@ -152,10 +138,8 @@ class FreeSpace:
         return np.array([[place[name] for place in places] for name in names])
 
 
-def search_path(
-    mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array, where: str
-) -> PiecewisePolynomial:
-    """Return a path of q over s from 0 to 1 between closed configurations (nq,), three times differentiable.
+def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array) -> CoordinatePath:
+    """Return a path between two closed configurations (nq,), three times differentiable.
 
     Parameters
     ----------
@@ -163,36 +147,32 @@ def search_path(
     limits : MotionLimits
         Those of coordinates, singularity and points hold along the path.
     start, end : (nq,) arrays
-    where : str
-        Begins the messages.
+        Within the limits.
 
     Raises
     ------
     InputError
-        An end violates a limit, or a singular configuration separates the ends.
+        Singular configurations separate the ends.
     NumericalError
         No path was found.
     """
     space = FreeSpace(mechanism, limits, start)
     ends = space.node(start), space.node(end)
-    for node, name in zip(ends, ("from", "to"), strict=True):
-        if violation := space.describe_violation(node):
-            raise InputError(f"{where}: {name}: {violation}; change it or the limit")
     if _is_same(*ends)[0]:
-        return PiecewisePolynomial(np.array([0.0, 1.0]), ends[0].values[None], end=1.0)
+        return CoordinatePath(PiecewisePolynomial(np.array([0.0, 1.0]), ends[0].values[None], end=1.0), start=start)
     corners = _connect(space, *ends, MAX_ATTEMPTS if mechanism.d > 1 else 0)
-    path = None if corners is None else _round(space, _shorten(space, corners))
-    if path is not None:
-        return path
+    q = None if corners is None else _round(space, _shorten(space, corners))
+    if q is not None:
+        return CoordinatePath(q, start=start)
     if aspects := describe_separation(mechanism, start, end, ("`from`", "`to`")):
-        raise InputError(f"{where}: not connected: {aspects}; singular configurations are between them, see `ckc map`")
+        raise InputError(f"optimize: not connected: {aspects}; see `ckc map`")
     if mechanism.d == 1:
         raise NumericalError(
-            f"{where}: stuck: {mechanism.independent[0]} cannot go straight from `from` to `to` within the limits; if "
+            f"optimize: stuck: {mechanism.independent[0]} cannot go straight from `from` to `to` within the limits; if "
             "it turns, a target that differs by 2 pi may be on the other side"
         )
     raise NumericalError(
-        f"{where}: stuck: no path from `from` to `to` was found in {MAX_ATTEMPTS} attempts; singular configurations or "
+        f"optimize: stuck: no path from `from` to `to` was found in {MAX_ATTEMPTS} attempts; singular configurations or "
         "limits may separate them. `ckc map` shows the former; plan in several parts, or with wider limits"
     )
 

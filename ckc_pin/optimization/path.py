@@ -31,17 +31,20 @@ class CoordinatePath(Immutable):
     q : PiecewisePolynomial
         Of s, twice continuously differentiable.
     warnings : tuple of str
+    start : (nq,) array, optional
+        Closed configuration from which the path is followed; as assembled by default.
     """
 
     q: PiecewisePolynomial
     warnings: tuple[str, ...] = field(default=())
+    start: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PathMotion:
     """q(s(t)): a motion along a path."""
 
-    path: PiecewisePolynomial
+    path: CoordinatePath
     profile: SpeedProfile
 
     @property
@@ -52,7 +55,7 @@ class PathMotion:
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
         s, s_dot, s_ddot = self.profile(t)
-        q, q_s, q_ss = self.path(s)
+        q, q_s, q_ss = self.path.q(s)
         return q, q_s * s_dot[:, None], q_s * s_ddot[:, None] + q_ss * s_dot[:, None] ** 2
 
 

@@ -25,12 +25,12 @@ from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
-from ckc_pin.optimization.path import CoordinatePath, PathMotion
+from ckc_pin.optimization.path import PathMotion
 from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
 
-__all__ = ["plan_between"]
+__all__ = ["plan_between", "require_inside", "require_regular", "resolve_state"]
 
 FIRST_INTERVALS = 40
 MAX_MESHES = 16
@@ -72,7 +72,7 @@ def plan_between(
     for state, name in ((start, "from"), (end, "to")):
         require_inside(mechanism, limits, state, name)
     dynamics = ReducedDynamics(mechanism)
-    _require_regular(dynamics, limits, start, end)
+    require_regular(dynamics, limits, start, end)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
     motion = _guess_motion(dynamics, spec.minimize, limits, start, end)
@@ -200,6 +200,7 @@ def resolve_state(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, nam
 
 
 def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
+    """Require that a configuration and its rates are within the limits (InputError)."""
     numbers = mechanism.tree.to_coordinates(state.at.q_tree)
     beyond = np.maximum(limits.q[0] - numbers, numbers - limits.q[1])
     k = int(np.argmax(beyond))
@@ -224,7 +225,8 @@ def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, 
         )
 
 
-def _require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+def require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+    """Require that the end is within the limit of singularity (InputError)."""
     margin = dynamics.margins(np.array([start.at.q_tree, end.at.q_tree]))[1]
     if margin < limits.singularity:
         raise InputError(
@@ -240,15 +242,15 @@ def _guess_motion(
     dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
 ) -> CoordinateMotion:
     """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
-    path = CoordinatePath(search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree, "optimize"))
+    path = search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree)
     at_rest = not start.rates.any() and not end.rates.any()
     moves = np.abs(end.q - start.q).max() > 0
     s = (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2
-    along = path_dynamics(dynamics, path, s, start.at.q_tree)
+    along = path_dynamics(dynamics, path, s)
     if at_rest and moves:
         try:
             profile, _ = find_fastest(dynamics, along, limits)
-            return Slowed(PathMotion(path.q, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
+            return Slowed(PathMotion(path, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
         except (InputError, NumericalError):
             pass
     force = np.abs(along.inertia).max() * 6
