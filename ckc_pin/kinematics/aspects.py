@@ -36,14 +36,14 @@ def describe_separation(mechanism: Mechanism, start: Array, end: Array, names: t
     # A configuration in a sliver beside a singular curve may be in a cell that is not reached. So both ways are tried.
     if _contains(fill_grid(domain, start), end) or _contains(fill_grid(domain, end), start):
         return ""
-    aspects = ["an aspect that the map does not number"] * 2
+    aspects = ["another aspect"] * 2
     for number, branch in reversed(list(enumerate(find_branches(task)[0], start=1))):
         grid = fill_grid(domain, branch)
         for k, q_tree in enumerate((start, end)):
             if _contains(grid, q_tree):
                 aspects[k] = f"aspect {number}{' (as assembled)' if number == 1 else ''}"
     size = " x ".join([str(CELLS)] * mechanism.d)
-    return f"{names[0]} is in {aspects[0]}, {names[1]} in {aspects[1]} of the map with {size} cells"
+    return f"in the map with {size} cells, {names[0]} is in {aspects[0]} and {names[1]} in {aspects[1]}"
 
 
 def _contains(grid: Grid, q_tree: Array) -> bool:

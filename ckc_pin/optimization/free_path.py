@@ -22,6 +22,8 @@ from ckc_pin.optimization.path import CoordinatePath, round_corners
 __all__ = ["FreeSpace", "search_path"]
 
 MAX_ATTEMPTS = 2000  # random configurations that the trees grow towards
+CLEARANCE = 0.3  # of the smaller sigma_min of the ends: least one of a path that is preferred
+CLEAR_ATTEMPTS = 400  # at such a path
 BATCH = 16  # of them, towards which a tree grows at once
 MAX_BRANCH = 1.0  # rad, or sizes of the mechanism: length of a tree's branch towards a random configuration
 MIN_BRANCH = 1e-2  # the same: shorter branches are not added
@@ -52,15 +54,19 @@ class FreeSpace:
     limits : MotionLimits
     start : (nq,) array
         The closed configuration whose smallest singular value of phi_z the limit of singularity is relative to.
+    min_sigma : float
+        Another lower limit of the smallest singular value.
     """
 
-    def __init__(self, mechanism: Mechanism, limits: MotionLimits, start: Array) -> None:
+    def __init__(self, mechanism: Mechanism, limits: MotionLimits, start: Array, min_sigma: float = 0.0) -> None:
         self.mechanism, self.limits = mechanism, limits
         extended = extend_closure(mechanism)
         self.task = Task(extended, extended.joints)
         self.scale = mechanism.tree.step_scale[mechanism.partition.q]
         self._limited = np.flatnonzero(np.isfinite(limits.q).any(axis=0))
-        self._min_sigma = limits.singularity and limits.singularity * float(self._sigma(self.node(start))[0])
+        self._min_sigma = min_sigma
+        if limits.singularity:
+            self._min_sigma = max(min_sigma, limits.singularity * float(self.sigma_min(self.node(start))[0]))
 
     def node(self, q_tree: Array) -> Nodes:
         """Return a closed configuration (nq,) as a node."""
@@ -81,7 +87,7 @@ class FreeSpace:
         for p, (_, centre, radius) in zip(self._points(nodes), self.limits.spheres, strict=True):
             columns.append(np.linalg.norm(p - centre, axis=1)[:, None] - radius)
         if self._min_sigma:
-            columns.append(self._sigma(nodes)[:, None] - self._min_sigma)
+            columns.append(self.sigma_min(nodes)[:, None] - self._min_sigma)
         return np.hstack(columns)
 
     def length(self, step: Array) -> Array:
@@ -115,7 +121,7 @@ class FreeSpace:
     def _phi_z(self, nodes: Nodes) -> Array:
         return nodes.J[:, self.task.extended.free][:, :, self.mechanism.partition.z]
 
-    def _sigma(self, nodes: Nodes) -> Array:
+    def sigma_min(self, nodes: Nodes) -> Array:
         """Return the smallest singular values of phi_z, infinite without loops."""
         phi_z = self._phi_z(nodes)
         if not phi_z.shape[2]:
@@ -141,6 +147,8 @@ class FreeSpace:
 def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array) -> CoordinatePath:
     """Return a path between two closed configurations (nq,), three times differentiable.
 
+    A path at some distance from singular configurations is preferred.
+
     Parameters
     ----------
     mechanism : Mechanism
@@ -160,20 +168,23 @@ def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: A
     ends = space.node(start), space.node(end)
     if _is_same(*ends)[0]:
         return CoordinatePath(PiecewisePolynomial(np.array([0.0, 1.0]), ends[0].values[None], end=1.0), start=start)
-    corners = _connect(space, *ends, MAX_ATTEMPTS if mechanism.d > 1 else 0)
-    q = None if corners is None else _round(space, _shorten(space, corners))
-    if q is not None:
-        return CoordinatePath(q, start=start)
+    usual = min(float(space.sigma_min(node)[0]) for node in ends)
+    clear = FreeSpace(mechanism, limits, start, CLEARANCE * usual if mechanism.dependent else 0.0)
+    for within, attempts in ((clear, CLEAR_ATTEMPTS), (space, MAX_ATTEMPTS)):
+        corners = _connect(within, *ends, attempts if mechanism.d > 1 else 0)
+        q = None if corners is None else _round(within, _shorten(within, corners))
+        if q is not None:
+            return CoordinatePath(q, start=start)
     if aspects := describe_separation(mechanism, start, end, ("`from`", "`to`")):
-        raise InputError(f"optimize: not connected: {aspects}; see `ckc map`")
+        raise InputError(f"optimize: not connected: {aspects}; see `ckc map {mechanism.name}`")
     if mechanism.d == 1:
         raise NumericalError(
             f"optimize: stuck: {mechanism.independent[0]} cannot go straight from `from` to `to` within the limits; if "
             "it turns, a target that differs by 2 pi may be on the other side"
         )
     raise NumericalError(
-        f"optimize: stuck: no path from `from` to `to` was found in {MAX_ATTEMPTS} attempts; singular configurations or "
-        "limits may separate them. `ckc map` shows the former; plan in several parts, or with wider limits"
+        f"optimize: stuck: no path from `from` to `to` was found in {MAX_ATTEMPTS} attempts; a limit or a singular "
+        "configuration may separate them. Plan in several parts or with wider limits, and see `ckc map`"
     )
 
 

@@ -352,6 +352,22 @@ def identification(
     raise typer.Exit(identification_trials.main(names, method, trials))
 
 
+@app.command(epilog=examples("planning", "planning five_bar --tasks 10"))
+def planning(
+    cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
+    tasks: Annotated[int | None, typer.Option(min=1, help="of each case; default: 200 of all cases")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the random ends")] = 0,
+) -> None:
+    """Plan random motions from one configuration to another, and replay them.
+
+    Prints the share of solved tasks, and the reasons of the others. Exits with 1 if less than 95 % are solved.
+    """
+    from scripts.experiments import planning_trials
+
+    names = check_names(cases, planning_trials.CASES, "case") or planning_trials.CASES
+    raise typer.Exit(planning_trials.main(names, tasks, seed))
+
+
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """Make the pictures of docs/images with a browser."""
