@@ -54,7 +54,7 @@ def table(**motor: Any) -> Mechanism:
     </robot>"""
     return Mechanism.from_urdf(
         urdf, gravity=[0, -GRAVITY, 0], motors=[{"joint": "x", **motor}, {"joint": "y", **motor}],
-        points={"bead": "bead"}, q_guess={"x": 0.0, "y": 0.0},
+        points=[{"name": "bead", "frame": "bead"}], q_guess={"x": 0.0, "y": 0.0},
     )  # fmt: skip
 
 
