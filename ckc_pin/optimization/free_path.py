@@ -238,18 +238,18 @@ def _connect(space: FreeSpace, start: Nodes, end: Nodes, attempts: int) -> Nodes
     random, box = np.random.default_rng(0), _boxes(space, start, end)
     trees = [_Tree(space, start), _Tree(space, end)]
     for round_ in range(attempts // BATCH):
-        growing, other = trees[round_ % 2], trees[1 - round_ % 2]
+        active, other = trees[round_ % 2], trees[1 - round_ % 2]
         lower, upper = box[(round_ // 2) % 2]
-        numbers, _ = growing.grow(lower + (upper - lower) * random.random((BATCH, len(lower))), MAX_BRANCH)
+        numbers, _ = active.grow(lower + (upper - lower) * random.random((BATCH, len(lower))), MAX_BRANCH)
         numbers = numbers[numbers >= 0]
         if not len(numbers):
             continue
-        targets = growing.nodes[numbers]
+        targets = active.nodes[numbers]
         ends, arrived = other.grow(targets.values, np.inf)
         for k in np.flatnonzero(arrived):
             if _is_same(other.nodes[ends[k : k + 1]], targets[k : k + 1])[0]:
-                here, there = growing.way_to_root(int(numbers[k])), other.way_to_root(int(ends[k]))
-                path = growing.nodes[np.array(here[::-1])].joined(other.nodes[np.array(there[1:], dtype=np.intp)])
+                here, there = active.way_to_root(int(numbers[k])), other.way_to_root(int(ends[k]))
+                path = active.nodes[np.array(here[::-1])].joined(other.nodes[np.array(there[1:], dtype=np.intp)])
                 return path if round_ % 2 == 0 else path[np.arange(len(path.values))[::-1]]
     return None
 
@@ -286,7 +286,7 @@ def _shorten(space: FreeSpace, path: Nodes) -> Nodes:
         failed += 1
         if not len(cuts):
             continue
-        ends = [_along(space, path, s, cuts[:, k], pieces[:, k]) for k in (0, 1)]
+        ends = [_find_places_along(space, path, s, cuts[:, k], pieces[:, k]) for k in (0, 1)]
         step = ends[1].values - ends[0].values
         saved = cuts[:, 1] - cuts[:, 0] - space.length(step)
         reached, arrived = space.follow(ends[0], step)
@@ -299,7 +299,7 @@ def _shorten(space: FreeSpace, path: Nodes) -> Nodes:
     return path
 
 
-def _along(space: FreeSpace, path: Nodes, s: Array, at: Array, piece: IntArray) -> Nodes:
+def _find_places_along(space: FreeSpace, path: Nodes, s: Array, at: Array, piece: IntArray) -> Nodes:
     """Return the configurations at lengths along a path."""
     start = path[piece]
     part = (at - s[piece]) / (s[piece + 1] - s[piece])

@@ -130,7 +130,7 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progre
     is_free = spec.path is not None and spec.path.shape == "free"
     if (spec.path is None or is_free) == (spec.to is None):
         got = "neither" if spec.to is None else "both"
-        raise InputError(f'optimize: expected either `to` or `path` (both with path.shape = "free"), got {got}')
+        raise InputError(f'optimize: expected either `to` or `path`, got {got}; path.shape = "free" needs both')
     limits = make_limits(spec.limits, mechanism)
     with one_blas_thread():
         if spec.path is None:
@@ -269,7 +269,7 @@ def _torque_table(
     -h^2 / 12 of the second derivative, with h the distance of rows.
     """
     corners = motion.corners
-    gap = CORNER_GAP * corners[-1]
+    gap = np.minimum(CORNER_GAP * corners[-1], np.diff(corners) / 4)
     begin, end = corners[:-1] + gap / 2, corners[1:] - gap / 2
     begin[0], end[-1] = 0.0, corners[-1]
     three = np.stack([begin, (begin + end) / 2, end], axis=1)

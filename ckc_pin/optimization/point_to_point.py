@@ -40,6 +40,8 @@ REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
+RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
+SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # statuses of IPOPT
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
 
@@ -88,6 +90,10 @@ def plan_between(
         optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
+        duration = _duration(spec.minimize, limits, RETRY_SLOWER * guess.duration)
+        if attempt == 0 and solution.status not in SOLVED and duration > guess.duration:
+            motion = Slowed(motion, duration)  # The optimizer often succeeds from a slower motion.
+            continue
         _require_solved(solution, limits)
         friction.end_mesh()
         plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
@@ -342,7 +348,7 @@ def sample_motion(
 
 
 def _require_solved(solution: Solution, limits: MotionLimits) -> None:
-    if solution.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+    if solution.status in SOLVED:
         return
     label, size = solution.violation
     if solution.status == "Infeasible_Problem_Detected":

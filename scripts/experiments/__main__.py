@@ -368,6 +368,21 @@ def planning(
     raise typer.Exit(planning_trials.main(names, tasks, seed))
 
 
+@app.command(epilog=examples("time_optimal", "time_optimal delta --intervals 200"))
+def time_optimal(
+    cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
+    intervals: Annotated[int, typer.Option(min=20, help="of the path")] = 1000,
+) -> None:
+    """Compare durations along paths with `toppra`, which has to be installed.
+
+    Exits with 1 if one differs by more than 0.1 %.
+    """
+    from scripts.experiments import time_optimal_peer
+
+    names = check_names(cases, time_optimal_peer.CASES, "case") or time_optimal_peer.CASES
+    raise typer.Exit(time_optimal_peer.main(names, intervals))
+
+
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """Make the pictures of docs/images with a browser."""

@@ -25,7 +25,7 @@ from scripts.experiments.identification_trials import load_case
 __all__ = ["CASES", "main", "make_tasks", "run_task"]
 
 REPLAY, CLOSURE = 1e-6, 1e-10  # rad, rad/s, m, m/s; largest |phi|
-HELD = 0.7  # of the torque limit: largest torque that holds an end
+MAX_HOLDING_SHARE = 0.7  # of the torque limit: largest torque that holds an end
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ CASES = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskResult:
     """Result of a task: the reason of a failure, "" if there is none, wall time in s, and the replay's error."""
 
     reason: str
@@ -80,19 +80,19 @@ def make_tasks(mechanism: Mechanism, case: Case, count: int, seed: int = 0) -> l
         step = case.spread * space.scale * random.uniform(-1, 1, (1, mechanism.d))
         node, arrived = space.follow(assembled, step)
         q = node.values[0]
-        if arrived[0] and np.abs(ckc_pin.terms(mechanism, q, 0 * q).h).max() <= HELD * case.torque:
+        if arrived[0] and np.abs(ckc_pin.terms(mechanism, q, 0 * q).h).max() <= MAX_HOLDING_SHARE * case.torque:
             ends.append(q)
     return list(zip(ends[::2], ends[1::2], strict=True))
 
 
-def run_task(mechanism: Mechanism, case: Case, start: Array, end: Array) -> Outcome:
+def run_task(mechanism: Mechanism, case: Case, start: Array, end: Array) -> TaskResult:
     """Plan a task and check its replay."""
     names, begin = mechanism.independent, perf_counter()
     tables = [{"q": dict(zip(names, q.tolist(), strict=True))} for q in (start, end)]
     try:
         plan = ckc_pin.optimize(mechanism, start=tables[0], to=tables[1], limits={"torque": case.torque})
     except ckc_pin.CkcError as error:
-        return Outcome(str(error), perf_counter() - begin)
+        return TaskResult(str(error), perf_counter() - begin)
     seconds = perf_counter() - begin
     replay = plan.replay
     checks = {
@@ -100,7 +100,7 @@ def run_task(mechanism: Mechanism, case: Case, start: Array, end: Array) -> Outc
         f"closure {replay.closure:.0e}": replay.closure > CLOSURE,
         f"torque {replay.max_tau:.4g}": replay.max_tau > case.torque * (1 + 1e-9),
     }
-    return Outcome("; ".join(text for text, fails in checks.items() if fails), seconds, replay.error)
+    return TaskResult("; ".join(text for text, fails in checks.items() if fails), seconds, replay.error)
 
 
 def main(names: Collection[str], tasks: int | None, seed: int) -> int:
@@ -111,12 +111,12 @@ def main(names: Collection[str], tasks: int | None, seed: int) -> int:
     for name in names:
         mechanism, case = load(name), CASES[name]
         pairs = make_tasks(mechanism, case, tasks or case.tasks, seed)
-        outcomes = [run_task(mechanism, case, *pair) for pair in pairs]
-        solved = [x for x in outcomes if not x.reason]
-        for k, x in enumerate(outcomes):
+        results = [run_task(mechanism, case, *pair) for pair in pairs]
+        solved = [x for x in results if not x.reason]
+        for k, x in enumerate(results):
             if x.reason:
                 reasons[f"{name}, task {k}, {x.seconds:.1f} s: {x.reason}"] += 1
-        seconds = float(np.median([x.seconds for x in outcomes]))
+        seconds = float(np.median([x.seconds for x in results]))
         error = max((x.error for x in solved), default=np.nan)
         print(f"| {name} | {len(pairs)} | {len(solved)} | {seconds:.1f} s | {error:.0e} |", flush=True)
         missed |= len(solved) < case.share * len(pairs)

@@ -171,7 +171,7 @@ def test_paths_of_spatial_mechanisms_are_closed_and_regular(name: str) -> None:
     [
         ({"path": {"shape": "free", "q": {"theta_1": [0.0], "theta_3": [0.0]}}}, "path.q does not belong to shape"),
         ({"path": {"shape": "free", "rounding": 0.1}}, "path.rounding does not belong to shape"),
-        ({"to": None}, 'expected either `to` or `path` (both with path.shape = "free"), got neither'),
+        ({"to": None}, 'expected either `to` or `path`, got neither; path.shape = "free" needs both'),
         ({"path": {"shape": "lines"}}, "got both"),
         (
             {"start": {"at": "assembled", "q_dot": {"theta_1": 1.0}}},
