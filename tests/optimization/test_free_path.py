@@ -13,6 +13,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.optimization.free_path import FreeSpace, search_path
 from ckc_pin.optimization.limits import make_limits
+from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import KeepOutSpec, LimitsSpec, SphereSpec
 from scripts.experiments.identification_trials import load_case
 from tests.analytic.five_bar import FiveBar
@@ -53,6 +54,17 @@ def test_a_path_leads_around_singular_configurations(target: list[float]) -> Non
         sides = [path.q(np.array([x + h]))[1:] for h in (-1e-9, 1e-9)]
         for k, scale in enumerate((q_s, q_ss)):
             assert np.abs(sides[0][k] - sides[1][k]).max() < 1e-5 * np.abs(scale).max()
+
+
+def test_places_near_singular_configurations_are_followed() -> None:
+    """The sine of the angle between the distal links is 0.0095 on the line. Longer steps would lead beyond it."""
+    five_bar = load("five_bar")
+    start, end = five_bar.q_tree[[0, 2]], np.array([2.0, -5.0])
+    q = start + np.outer(np.linspace(0, 1, 24), end - start)
+    q_tree = ReducedDynamics(five_bar).follow(five_bar.q_tree, q)
+    assert q_tree is not None
+    expected = np.array([FIVE_BAR.sigma(x) for x in q])
+    assert np.abs(np.exp(1j * q_tree) - np.exp(1j * expected)).max() < 1e-9
 
 
 def test_no_path_leads_where_another_aspect_is() -> None:
