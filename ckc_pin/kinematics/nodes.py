@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,16 @@ from ckc_pin.kinematics.extended import Task
 from ckc_pin.mechanism.batch import ManyPoses, integrate_many
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MIN_PIECE", "Nodes", "find_solutions", "follow", "nodes_at", "shape_points", "solve"]
+__all__ = [
+    "MIN_PIECE",
+    "SAME_SHAPE_TOLERANCE",
+    "Nodes",
+    "find_solutions",
+    "follow",
+    "nodes_at",
+    "shape_points",
+    "solve",
+]
 
 MAX_ITERATIONS = 8  # of Newton's method
 MIN_PIECE = 2.0**-8  # of a path
@@ -20,6 +30,9 @@ TOLERANCE = 1e-10  # mechanism sizes: largest |Psi| of a solution
 RANDOM_STARTS = 400
 MAX_SEARCH_STEPS = 60  # from a random start
 SAME_SHAPE_TOLERANCE = 1e-6  # mechanism sizes: distance of all points below which two configurations look the same
+
+
+Accept = Callable[["Nodes", "Nodes"], BoolArray]
 
 
 @dataclass
@@ -42,8 +55,12 @@ class Nodes:
     J: Array
     det: Array
 
-    def __getitem__(self, which: IntArray | BoolArray) -> Nodes:
+    def __getitem__(self, which: IntArray | BoolArray | slice) -> Nodes:
         return Nodes(self.q_tree[which], self.values[which], self.J[which], self.det[which])
+
+    def joined(self, other: Nodes) -> Nodes:
+        """Return these nodes and then the others."""
+        return Nodes(*(np.concatenate([getattr(self, x), getattr(other, x)]) for x in ("q_tree", "values", "J", "det")))
 
     def put(self, which: IntArray | BoolArray, other: Nodes) -> None:
         """Replace some of the nodes."""
@@ -112,7 +129,9 @@ def _solve(matrix: Array, right: Array) -> Array:
         return solution
 
 
-def follow(task: Task, start: Nodes, step: Array, min_piece: float = MIN_PIECE) -> tuple[Nodes, BoolArray]:
+def follow(
+    task: Task, start: Nodes, step: Array, min_piece: float = MIN_PIECE, accept: Accept | None = None
+) -> tuple[Nodes, BoolArray]:
     """Change the prescribed values of nodes along straight lines, each node on its branch.
 
     Parameters
@@ -123,6 +142,8 @@ def follow(task: Task, start: Nodes, step: Array, min_piece: float = MIN_PIECE) 
         Change of the prescribed values.
     min_piece : float
         A path ends where a piece shorter than this fraction would be needed.
+    accept : callable, optional
+        Gets the nodes at both ends of pieces. Returns which pieces are accepted; others are shortened.
 
     Returns
     -------
@@ -141,6 +162,8 @@ def follow(task: Task, start: Nodes, step: Array, min_piece: float = MIN_PIECE) 
         guess = integrate_many(tree, here.q_tree, np.where(local[:, None], prediction, 0.0))
         trial, is_solved = solve(task, guess, start.values[active] + (done + part)[:, None] * step[active])
         succeeded = is_solved & local & (trial.det * here.det > 0)
+        if accept is not None and succeeded.any():
+            succeeded[succeeded] = accept(here[succeeded], trial[succeeded])
         at.put(active[succeeded], trial[succeeded])
         return succeeded
 

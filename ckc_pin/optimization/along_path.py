@@ -72,10 +72,8 @@ class PathDynamics(Immutable):
         return self.inertia * u + self.centrifugal * b + self.damping * np.sqrt(b) + self.static
 
 
-def path_dynamics(
-    dynamics: ReducedDynamics, path: CoordinatePath, s: Array, start: Array | None = None
-) -> PathDynamics:
-    """Return the equations of motion at places of a path, followed from a configuration, as assembled by default.
+def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> PathDynamics:
+    """Return the equations of motion at places of a path.
 
     Raises
     ------
@@ -84,7 +82,7 @@ def path_dynamics(
     """
     mechanism = dynamics.mechanism
     q, q_s, q_ss = path.q(s)
-    q_tree = follow_places(dynamics, q, s, start)
+    q_tree = follow_places(dynamics, q, s, path.start)
     zero, no_torque = np.zeros_like(q), np.zeros((len(s), dynamics.motors))
     at_rest = dynamics.instants(q_tree, zero, zero, no_torque)
     forth = dynamics.instants(q_tree, q_s, q_ss, no_torque)
@@ -105,8 +103,8 @@ def path_dynamics(
     )
 
 
-def follow_places(dynamics: ReducedDynamics, q: Array, s: Array, start: Array | None = None) -> Array:
-    """Return closed configurations at q (m, d), each followed from the one before, from a start on.
+def follow_places(dynamics: ReducedDynamics, q: Array, s: Array, start: Array | None) -> Array:
+    """Return closed configurations at q (m, d), each followed from the one before, from a start or as assembled on.
 
     Raises
     ------
@@ -114,9 +112,10 @@ def follow_places(dynamics: ReducedDynamics, q: Array, s: Array, start: Array | 
         The loops do not close.
     """
     mechanism = dynamics.mechanism
-    q_tree = dynamics.follow(mechanism.q_tree if start is None else start, q)
+    start = mechanism.q_tree if start is None else start
+    q_tree = dynamics.follow(start, q)
     if q_tree is None:
-        count = next(k for k in range(len(q)) if dynamics.follow(mechanism.q_tree, q[: k + 1]) is None)
+        count = next(k for k in range(len(q)) if dynamics.follow(start, q[: k + 1]) is None)
         place = ", ".join(f"{name} = {x:.4g}" for name, x in zip(mechanism.independent, q[count], strict=True))
         raise InputError(
             f"optimize: path: the loops cannot be kept closed on this branch at s = {s[count]:.4f} ({place}); choose a "

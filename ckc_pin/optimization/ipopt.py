@@ -10,13 +10,13 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 
-__all__ = ["Ipopt", "Optimum", "Program", "merge_patterns", "nonzeros"]
+__all__ = ["Ipopt", "NonlinearProgram", "Optimum", "merge_patterns", "nonzeros"]
 
 CONSTRAINT_TOLERANCE = 1e-9
 WARM_BARRIER = 1e-6  # first barrier parameter of a warm start
 
 
-class Program(Protocol):
+class NonlinearProgram(Protocol):
     """Minimize a cost of variables within bounds of the variables and of constraints."""
 
     size: int
@@ -54,7 +54,7 @@ class Ipopt:
 
     Parameters
     ----------
-    program : Program
+    program : NonlinearProgram
     iterations : int
         Largest number.
     tolerance : float
@@ -66,7 +66,7 @@ class Ipopt:
     """
 
     def __init__(
-        self, program: Program, *, iterations: int, tolerance: float, warm: bool, barrier: float = WARM_BARRIER
+        self, program: NonlinearProgram, *, iterations: int, tolerance: float, warm: bool, barrier: float = WARM_BARRIER
     ) -> None:
         import casadi as cs
 

@@ -23,10 +23,11 @@ from ckc_pin.optimization.along_path import (
     minimum_norm_within,
     path_dynamics,
 )
+from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.limits import MotionLimits, make_limits
 from ckc_pin.optimization.path import CoordinatePath, PathMotion, make_path
 from ckc_pin.optimization.plan import Plan, find_active, measure, replay_plan
-from ckc_pin.optimization.point_to_point import plan_between
+from ckc_pin.optimization.point_to_point import plan_between, require_inside, require_regular, resolve_state
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
 from ckc_pin.optimization.spec import LimitsSpec, MinimizeSpec, OptimizeSpec, PathSpec, make_spec, read_optimize
 from ckc_pin.optimization.speed_profile import SpeedProfile
@@ -71,7 +72,8 @@ def optimize(
     path : mapping, optional
         The keys of ``[path]``, of the fastest motion along one:
         ``{"q": {"theta_1": [-1.2, -1.0], "theta_3": [-1.9, -1.7]}}``, or
-        ``{"point": {"tip": [[0.1, -0.4, 0.0], [0.2, -0.4, 0.0]]}}``.
+        ``{"point": {"tip": [[0.1, -0.4, 0.0], [0.2, -0.4, 0.0]]}}``. With ``{"shape": "free"}``, a path from `start` to
+        `to` is searched that keeps the limits and does not reach a singular configuration.
     minimize, limits : mapping, optional
         The keys of ``[minimize]`` and ``[limits]``: ``{"time": 1.0}``, ``{"torque": 3.0, "rate": 5.0}``.
     desired : mapping, optional
@@ -138,8 +140,10 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progre
     mechanism.refuse_prescribed_joints("optimize")
     if not mechanism.d:
         raise InputError(f"optimize: {mechanism.name} has no freedoms, so that nothing moves")
-    if (spec.path is None) == (spec.to is None):
-        raise InputError(f"optimize: expected either `to` or `path`, got {'both' if spec.to else 'neither'}")
+    is_free = spec.path is not None and spec.path.shape == "free"
+    if (spec.path is None or is_free) == (spec.to is None):
+        got = "neither" if spec.to is None else "both"
+        raise InputError(f'optimize: expected either `to` or `path`, got {got}; path.shape = "free" needs both')
     limits = make_limits(spec.limits, mechanism)
     with one_blas_thread():
         if spec.path is None:
@@ -149,9 +153,9 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progre
 
 def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits: MotionLimits) -> Plan:
     """Plan the fastest motion along a path."""
-    _refuse_on_path(spec.minimize, spec.limits)
-    path = make_path(table, mechanism)
+    _refuse_on_path(spec.minimize, spec.limits, is_free=table.shape == "free")
     dynamics = ReducedDynamics(mechanism)
+    path = make_path(table, mechanism) if table.shape != "free" else _find_free_path(dynamics, spec, table, limits)
     motion, sweeps = _refine_profile(dynamics, path, limits, spec.intervals)
     t_end = float(motion.corners[-1])
     if t_end > limits.time:
@@ -169,6 +173,27 @@ def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limit
     )  # fmt: skip
 
 
+def _find_free_path(
+    dynamics: ReducedDynamics, spec: OptimizeSpec, table: PathSpec, limits: MotionLimits
+) -> CoordinatePath:
+    """Return a path from one configuration to another within the limits."""
+    assert spec.to is not None
+    places = [key for key in ("q", "point", "rounding") if getattr(table, key) is not None]
+    if places:
+        raise InputError(f'optimize: path.{places[0]} does not belong to shape = "free"; remove it')
+    mechanism = dynamics.mechanism
+    start = resolve_state(mechanism, spec.start, mechanism.assembled, "from")
+    end = resolve_state(mechanism, spec.to, start.at, "to")
+    for state, name in ((start, "from"), (end, "to")):
+        require_inside(mechanism, limits, state, name)
+        if state.rates.any():
+            raise InputError(f"optimize: {name}.q_dot: a motion along a path begins and ends at rest; remove it")
+    require_regular(dynamics, limits, start, end)
+    if not np.any(end.q != start.q):
+        raise InputError("optimize: to: the same configuration as `from`; give another one")
+    return search_path(mechanism, limits, start.at.q_tree, end.at.q_tree)
+
+
 def _refine_profile(
     dynamics: ReducedDynamics, path: CoordinatePath, limits: MotionLimits, intervals: int | None
 ) -> tuple[PathMotion, int]:
@@ -183,7 +208,7 @@ def _refine_profile(
         along = path_dynamics(dynamics, path, s)
         _require_within(limits, along, dynamics)
         profile, sweeps = find_fastest(dynamics, along, narrowed)
-        motion, total = PathMotion(path.q, profile), total + sweeps
+        motion, total = PathMotion(path, profile), total + sweeps
         exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect)
         if round_ < SWITCH_REFINEMENTS:
             exceeded |= _switches(profile)
@@ -233,8 +258,10 @@ def _instants(
     The force (m,) is relative to the largest one.
     """
     mechanism = dynamics.mechanism
-    q, v, a = motion(t)
-    q_tree = follow_places(dynamics, q, t)
+    _, v, a = motion(t)
+    # The loops are followed through all corners, because the path may bend between the instants.
+    places = np.union1d(t, motion.corners)
+    q_tree = follow_places(dynamics, motion(places)[0], places, motion.path.start)[np.searchsorted(places, t)]
     at = dynamics.instants(q_tree, v, a, np.zeros((len(t), dynamics.motors)))
     rho = dynamics.rho(q_tree)
     friction = friction_force(mechanism, at.v_tree)
@@ -255,7 +282,7 @@ def _torque_table(
     -h^2 / 12 of the second derivative, with h the distance of rows.
     """
     corners = motion.corners
-    gap = CORNER_GAP * corners[-1]
+    gap = np.minimum(CORNER_GAP * corners[-1], np.diff(corners) / 4)
     begin, end = corners[:-1] + gap / 2, corners[1:] - gap / 2
     begin[0], end[-1] = 0.0, corners[-1]
     three = np.stack([begin, (begin + end) / 2, end], axis=1)
@@ -269,7 +296,7 @@ def _torque_table(
     return t, instants, instants.tau - correction
 
 
-def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec) -> None:
+def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec, *, is_free: bool) -> None:
     other = [name for name in ("effort", "energy", "jerk", "peak_torque", "tracking") if getattr(minimize, name)]
     if other:
         raise InputError(
@@ -277,7 +304,7 @@ def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec) -> None:
         )
     if not minimize.time:
         raise InputError("optimize: minimize.time: expected a weight above zero")
-    for name in ("torque_rate", "keep_out", "power", "jerk"):
+    for name in ("torque_rate", "power", "jerk") if is_free else ("torque_rate", "keep_out", "power", "jerk"):
         if getattr(limits, name):
             raise InputError(f"optimize: limits.{name}: not supported along a path; remove it")
 

@@ -16,7 +16,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.spec import PathSpec
 from ckc_pin.optimization.speed_profile import SpeedProfile
 
-__all__ = ["CoordinatePath", "PathMotion", "make_path"]
+__all__ = ["CoordinatePath", "PathMotion", "make_path", "round_corners"]
 
 DEFAULT_ROUNDING = 0.1  # of the shorter line at a corner
 STRAIGHT_TOLERANCE = 1e-9  # of the unit directions of two lines without a corner between them
@@ -31,17 +31,20 @@ class CoordinatePath(Immutable):
     q : PiecewisePolynomial
         Of s, twice continuously differentiable.
     warnings : tuple of str
+    start : (nq,) array, optional
+        Closed configuration from which the path is followed; as assembled by default.
     """
 
     q: PiecewisePolynomial
     warnings: tuple[str, ...] = field(default=())
+    start: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PathMotion:
     """q(s(t)): a motion along a path."""
 
-    path: PiecewisePolynomial
+    path: CoordinatePath
     profile: SpeedProfile
 
     @property
@@ -52,7 +55,7 @@ class PathMotion:
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
         s, s_dot, s_ddot = self.profile(t)
-        q, q_s, q_ss = self.path(s)
+        q, q_s, q_ss = self.path.q(s)
         return q, q_s * s_dot[:, None], q_s * s_ddot[:, None] + q_ss * s_dot[:, None] ** 2
 
 
@@ -132,11 +135,21 @@ def _round(
                 raise InputError(
                     f"{where}[{k}]: the path turns back on itself; split it there into two paths at rest between them"
                 )
+    for k, length in enumerate(lengths.tolist()):
+        if not length - reach[k] - reach[k + 1] >= 0:
+            raise InputError(f"{where}[{k}]: rounding is too large for the line of {length:.4g} that begins here")
+    corners = int(np.count_nonzero(reach))
+    said = (f"path: {corners} corners are rounded, from {reach.max():.3g} before to behind them",) if corners else ()
+    return round_corners(places, reach), said
+
+
+def round_corners(places: Array, reach: Array) -> PiecewisePolynomial:
+    """Return lines through places (k, dimension) whose corners are rounded from `reach` (k,) before to behind them."""
+    lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    directions = np.diff(places, axis=0) / lengths[:, None]
     breaks, pieces, distance = [0.0], list[Array](), 0.0
     for k, length in enumerate(lengths.tolist()):
         straight = length - reach[k] - reach[k + 1]
-        if not straight >= 0:
-            raise InputError(f"{where}[{k}]: rounding is too large for the line of {length:.4g} that begins here")
         if straight > 0:
             distance += straight
             breaks.append(distance)
@@ -151,9 +164,7 @@ def _round(
     total = breaks[-1]
     powers = total ** np.arange(7, -1, -1)
     coefficients = np.array(pieces).transpose(1, 0, 2) * powers[:, None, None]
-    corners = int(np.count_nonzero(reach))
-    said = (f"path: {corners} corners are rounded, from {reach.max():.3g} before to behind them",) if corners else ()
-    return PiecewisePolynomial(np.array(breaks) / total, coefficients, end=1.0), said
+    return PiecewisePolynomial(np.array(breaks) / total, coefficients, end=1.0)
 
 
 def _blend(start: Array, direction: Array, way: Array, end_direction: Array, length: float) -> Array:

@@ -21,10 +21,11 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
 from ckc_pin.optimization.collocation import TOLERANCE, Collocation
 from ckc_pin.optimization.dry_friction import FrictionKnots
+from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
-from ckc_pin.optimization.path import CoordinatePath, PathMotion
+from ckc_pin.optimization.path import PathMotion
 from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
@@ -37,6 +38,8 @@ __all__ = [
     "plan_between",
     "read_desired_motion",
     "refuse_unsupported",
+    "require_inside",
+    "require_regular",
     "require_solved",
     "resolve_state",
     "sample_motion",
@@ -48,9 +51,10 @@ MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
-VIA_ATTEMPTS = 60  # of paths through another configuration
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
+RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
+SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # statuses of IPOPT
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
 
@@ -83,7 +87,7 @@ def plan_between(
     for state, name in ((start, "from"), (end, "to")):
         require_inside(mechanism, limits, state, name)
     dynamics = ReducedDynamics(mechanism)
-    _require_regular(dynamics, limits, start, end)
+    require_regular(dynamics, limits, start, end)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
     motion = guess_motion(dynamics, spec.minimize, limits, start, end)
@@ -99,6 +103,10 @@ def plan_between(
         optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
+        duration = _duration(spec.minimize, limits, RETRY_SLOWER * guess.duration)
+        if attempt == 0 and solution.status not in SOLVED and duration > guess.duration:
+            motion = Slowed(motion, duration)  # The optimizer often succeeds from a slower motion.
+            continue
         require_solved(solution)
         friction.end_mesh()
         plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
@@ -212,6 +220,7 @@ def resolve_state(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, nam
 
 
 def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
+    """Require that a configuration and its rates are within the limits (InputError)."""
     numbers = mechanism.tree.to_coordinates(state.at.q_tree)
     beyond = np.maximum(limits.q[0] - numbers, numbers - limits.q[1])
     k = int(np.argmax(beyond))
@@ -236,7 +245,8 @@ def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, 
         )
 
 
-def _require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+def require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+    """Require that the end is within the limit of singularity (InputError)."""
     margin = dynamics.margins(np.array([start.at.q_tree, end.at.q_tree]))[1]
     if margin < limits.singularity:
         raise InputError(
@@ -252,15 +262,15 @@ def guess_motion(
     dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
 ) -> CoordinateMotion:
     """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
-    path = _find_path(dynamics, start, end)
+    path = search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree)
     at_rest = not start.rates.any() and not end.rates.any()
     moves = np.abs(end.q - start.q).max() > 0
     s = (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2
-    along = path_dynamics(dynamics, path, s, start.at.q_tree)
+    along = path_dynamics(dynamics, path, s)
     if at_rest and moves:
         try:
             profile, _ = find_fastest(dynamics, along, limits)
-            return Slowed(PathMotion(path.q, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
+            return Slowed(PathMotion(path, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
         except (InputError, NumericalError):
             pass
     force = np.abs(along.inertia).max() * 6
@@ -274,29 +284,6 @@ def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> f
     if not minimize.time:
         return limits.time
     return min(fastest, limits.time)
-
-
-def _find_path(dynamics: ReducedDynamics, start: EndState, end: EndState) -> CoordinatePath:
-    """Return a path that the loops can follow: the straight line in q, or two lines through another configuration."""
-    mechanism = dynamics.mechanism
-    random = np.random.default_rng(0)
-    scale = mechanism.tree.step_scale[mechanism.partition.q]
-    middle, spread = (start.q + end.q) / 2, np.abs(end.q - start.q) / 2 + 0.5 * scale
-    assembled = mechanism.independent_part(mechanism.q_tree)
-    for attempt in range(VIA_ATTEMPTS):
-        via = [middle, assembled][attempt] if attempt < 2 else middle + spread * random.uniform(-1, 1, dynamics.d)
-        # A quadratic curve through the middle place; the straight line at first.
-        c2 = 2 * (start.q + end.q) - 4 * via
-        c1 = end.q - start.q - c2
-        q = PiecewisePolynomial(np.array([0.0, 1.0]), np.array([c2, c1, start.q])[:, None, :], end=1.0)
-        path = CoordinatePath(q)
-        reached = dynamics.follow(start.at.q_tree, q(np.linspace(0.0, 1.0, GUESS_PLACES + 1))[0])
-        if reached is not None and np.abs(reached[-1] - end.at.q_tree).max() < 1e-6:
-            return path
-    raise NumericalError(
-        f"optimize: stuck: no path of the loops from `from` to `to` was found in {VIA_ATTEMPTS} attempts; a singular "
-        "configuration may separate them. `ckc map` shows the aspects; plan in several parts"
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,7 +362,7 @@ def sample_motion(
 
 
 def require_solved(solution: Solution) -> None:
-    if solution.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+    if solution.status in SOLVED:
         return
     label, size = solution.violation
     if solution.status == "Infeasible_Problem_Detected":

@@ -25,6 +25,7 @@ from ckc_pin.optimization.many_instants import InstantsFunction
 __all__ = ["Derivatives", "MotionInstants", "ReducedDynamics"]
 
 MAX_CONTINUATION_STEP = 0.25  # rad, or sizes of the mechanism: of q between two closures
+FINER_STEPS = (0.03, 0.004, 0.0005)  # the same, one after the other where a place cannot be followed
 MAX_FOLLOWED_STEP = 0.2  # rad, or sizes of the mechanism: from a configuration to those that are closed from it
 MAX_NEWTON_STEPS = 12
 MAX_NEWTON_STEP = 1.0  # rad, or sizes of the mechanism
@@ -157,17 +158,17 @@ class ReducedDynamics:
 
     # --- values ----------------------------------------------------------------------------------
 
-    def close(self, q_tree: Array, q: Array) -> Array | None:
+    def close(self, q_tree: Array, q: Array, step: float = MAX_CONTINUATION_STEP) -> Array | None:
         """Return closed configurations (m, nq) at q (m, d), followed from closed ones; None if the loops do not close.
 
-        det phi_z keeps its sign.
+        det phi_z keeps its sign. `step` is the longest of q between two closures, rad or sizes of the mechanism.
         """
         scale = self.mechanism.tree.step_scale[self.q_at]
         start = q_tree[:, self.q_in_tree]
         far = np.max(np.abs(q - start) / scale, initial=0.0)
         if not far < MAX_PIECES * MAX_CONTINUATION_STEP:
             return None
-        count = 1 + int(far / MAX_CONTINUATION_STEP)
+        count = 1 + int(far / step)
         _, jacobian = self._closure(q_tree)
         signs = np.sign(np.linalg.det(jacobian[:, :, self.z_in_tree]))
         for k in range(1, count + 1):
@@ -199,6 +200,8 @@ class ReducedDynamics:
             while closed is None and end > begin + 1:
                 end = begin + (end - begin) // 2
                 closed = self.close(np.tile(at, (end - begin, 1)), q[begin:end])
+            for step in FINER_STEPS:  # near singular configurations
+                closed = self.close(at, q[begin:end], step) if closed is None else closed
             if closed is None:
                 return None
             result[begin:end] = closed

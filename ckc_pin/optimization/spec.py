@@ -54,7 +54,7 @@ class StateSpec(FileStruct, frozen=True, kw_only=True):
 
 
 class PathSpec(FileStruct, frozen=True, kw_only=True):
-    """A path that the motion follows from its first to its last place, at rest at both: one of q and point.
+    """A path that the motion follows from its first to its last place, at rest at both: one of q and point, or neither.
 
     Attributes
     ----------
@@ -65,7 +65,8 @@ class PathSpec(FileStruct, frozen=True, kw_only=True):
         Places of one ``[[point]]``.
         ``point = {tip = [[0.1, -0.4, 0.0], [0.2, -0.4, 0.0]]}``
     shape
-        A spline through the places, or straight lines with rounded corners.
+        ``"spline"`` through the places, or straight ``"lines"`` with rounded corners. ``"free"`` is a short path from
+        ``[from]`` to ``[to]`` without singular configurations, within limits of coordinates, singularity and points.
         ``shape = "lines"``
     rounding : rad, m
         Distance from a corner at which its rounding begins, of ``shape = "lines"``; default: a tenth of the shorter of
@@ -75,7 +76,7 @@ class PathSpec(FileStruct, frozen=True, kw_only=True):
 
     q: dict[str, list[float]] | None = None
     point: dict[str, list[Vector3]] | None = None
-    shape: Literal["spline", "lines"] = "spline"
+    shape: Literal["spline", "lines", "free"] = "spline"
     rounding: Limit | None = None
 
 
@@ -181,7 +182,7 @@ class LimitsSpec(FileStruct, frozen=True, kw_only=True):
         Smallest singular value of φ_z, relative to its value at the start; a ratio.
         ``singularity = 0.1``
     keep_out
-        Regions that points stay out of, point to point.
+        Regions that points stay out of, from one configuration to another.
         ``keep_out = [{sphere = {centre = [0.1, -0.3, 0.0], radius = 0.05}, points = ["tip"]}]``
     """
 
@@ -212,7 +213,7 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
         Where the motion begins; as assembled if absent.
         ``from = {at = "equilibrium"}``
     to
-        Where it ends; either this or ``path``.
+        Where it ends; either this or ``path``, or both with ``path = {shape = "free"}``.
         ``to = {point = {plate = [0.1, 0.05, -0.3]}}``
     path
         The path of a time-optimal motion.

@@ -363,6 +363,37 @@ def importers(fmusim: Annotated[Path, typer.Argument(exists=True, dir_okay=False
     raise typer.Exit(importers.main(fmusim))
 
 
+@app.command(epilog=examples("planning", "planning five_bar --tasks 10"))
+def planning(
+    cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
+    tasks: Annotated[int | None, typer.Option(min=1, help="of each case; default: 200 of all cases")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="of the random ends")] = 0,
+) -> None:
+    """Plan random motions from one configuration to another, and replay them.
+
+    Prints the share of solved tasks, and the reasons of the others. Exits with 1 if less than 95 % are solved.
+    """
+    from scripts.experiments import planning_trials
+
+    names = check_names(cases, planning_trials.CASES, "case") or planning_trials.CASES
+    raise typer.Exit(planning_trials.main(names, tasks, seed))
+
+
+@app.command(epilog=examples("time_optimal", "time_optimal delta --intervals 200"))
+def time_optimal(
+    cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
+    intervals: Annotated[int, typer.Option(min=20, help="of the path")] = 1000,
+) -> None:
+    """Compare durations along paths with `toppra`, which has to be installed.
+
+    Exits with 1 if one differs by more than 0.1 %.
+    """
+    from scripts.experiments import time_optimal_peer
+
+    names = check_names(cases, time_optimal_peer.CASES, "case") or time_optimal_peer.CASES
+    raise typer.Exit(time_optimal_peer.main(names, intervals))
+
+
 @app.command(epilog=examples('pictures "$(./scripts/chromium)"'))
 def pictures(chromium: Annotated[Path, typer.Argument(exists=True, dir_okay=False)]) -> None:
     """Make the pictures of docs/images with a browser."""

@@ -25,6 +25,7 @@ PARTS = {
     "generated_sizes": (["1"], "| 1 | 3 |"),
     "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
+    "planning": (["five_bar", "--tasks", "2"], "| five_bar | 2 | 2 |"),
     "identification": (["leg", "--trials", "3"], "| leg | 3 | 10 |"),
     "peer": ([f"{sys.executable} {SCIPY_PEER}", "tracking_1e-04"], "tracking_1e-04: not compared, the law of"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
@@ -32,7 +33,7 @@ PARTS = {
 HAS_OUT = {"paper", "ensembles"}
 NOT_RUN = {
     "map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles", "iftomm",
-    "right_hand_sides",
+    "right_hand_sides", "time_optimal",
 }  # fmt: skip
 
 

@@ -35,6 +35,29 @@ def slider(*, damping: float = 0.0, friction: float = 0.0, **motor: Any) -> Mech
     )
 
 
+def table(**motor: Any) -> Mechanism:
+    """Return a bead on two crossed rails, along x and y."""
+    inertial = '<inertial><mass value="{}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    urdf = f"""
+    <robot name="table">
+      <link name="base"/>
+      <link name="beam">{inertial.format(1e-9)}</link>
+      <link name="bead">{inertial.format(MASS)}</link>
+      <joint name="x" type="prismatic">
+        <parent link="base"/><child link="beam"/><axis xyz="1 0 0"/>
+        <limit lower="-1" upper="1" effort="100" velocity="100"/>
+      </joint>
+      <joint name="y" type="prismatic">
+        <parent link="beam"/><child link="bead"/><axis xyz="0 1 0"/>
+        <limit lower="-1" upper="1" effort="100" velocity="100"/>
+      </joint>
+    </robot>"""
+    return Mechanism.from_urdf(
+        urdf, gravity=[0, -GRAVITY, 0], motors=[{"joint": "x", **motor}, {"joint": "y", **motor}],
+        points=[{"name": "bead", "frame": "bead"}], q_guess={"x": 0.0, "y": 0.0},
+    )  # fmt: skip
+
+
 def pendulum(**motor: Any) -> Mechanism:
     """Return a point mass on a massless rod; the angle is 0 where it hangs."""
     urdf = f"""

@@ -172,7 +172,7 @@ PATH = {"q": {"theta_1": [-1.4, -1.2], "theta_3": [-1.7, -1.6]}}
         ({"path": {**PATH, "rounding": 0.1}}, 'path.rounding belongs to shape = "lines"'),
         ({"path": {"point": {"tip": [[0.15, -0.55, 0.0], [3.0, 0.0, 0.0]]}}}, "cannot follow the path beyond"),
         (
-            {"path": {"q": {"theta_1": [-1.434, 2.0], "theta_3": [-1.707, -5.0]}}},
+            {"path": {"q": {"theta_1": [-1.434, 2.0], "theta_3": [-1.707, -5.5]}}},
             "cannot be kept closed on this branch",
         ),
         ({"limits": {}}, "limits: nothing limits the speed along the path"),
@@ -195,3 +195,10 @@ def test_wrong_input_is_explained(change: dict[str, Any], message: str) -> None:
 def test_motors_that_cannot_hold_the_mechanism_are_named() -> None:
     with pytest.raises(NumericalError, match=r"infeasible: at s = .* no speed is within the limits of tau\.hinge"):
         optimize(pendulum(torque_limit=1.0), path={"q": {"hinge": [0.0, 1.0]}})
+
+
+def test_a_fine_grid_is_replayed() -> None:
+    """Divided intervals of a fine grid are shorter than the gap between rows of the torques' table."""
+    path = {"a_1": [-0.675, -0.5, -0.4], "a_2": [1.419, 1.5, 1.3], "a_3": [3.514, 3.4, 3.5]}
+    plan = optimize("three_rrr", path={"q": path}, limits={"torque": 1.0}, intervals=1000)
+    require_replay(plan, 1.0)

@@ -13,7 +13,13 @@ from time import perf_counter
 import numpy as np
 
 from ckc_pin.analysis.map.desired_path import add_path, read_desired
-from ckc_pin.analysis.map.grid import (
+from ckc_pin.analysis.map.loci import find_loci
+from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.base.validation import require_callable, require_flag, require_type
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.extended import ExtendedClosure, Task, extend_closure, find_point
+from ckc_pin.kinematics.grid import (
     COARSE_FRACTION,
     Domain,
     Grid,
@@ -21,26 +27,19 @@ from ckc_pin.analysis.map.grid import (
     ProgressCounter,
     cell_centres,
     fill_grid,
-    make_joint_axis,
+    find_branches,
+    make_joint_domain,
     max_distance,
 )
-from ckc_pin.analysis.map.loci import find_loci
-from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import require_callable, require_flag, require_type
-from ckc_pin.errors import InputError
-from ckc_pin.kinematics.extended import ExtendedClosure, Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Aspect, Axis, Locus, Path, SingularityMap, Space
-from ckc_pin.kinematics.nodes import find_solutions, nodes_at
+from ckc_pin.kinematics.nodes import nodes_at
 from ckc_pin.mechanism.batch import ManyPoses
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.scene import EXPECTED_SCENE, Scene, load_scene
 
 __all__ = ["add_positions", "make_map", "singularity_map"]
 
-MAX_BRANCHES = 4
-MAX_DEPENDENT = 12  # coordinates; of larger mechanisms, and of free bodies, only the assembled branch is mapped
 CELL_MULTIPLE = 8  # cells along an axis, so that coarse grids lie on the fine one
 MIN_CELLS, MAX_CELLS = 16, 2000  # along an axis
 WINDOW_CELLS = 48  # along an axis, while a Cartesian window is searched for
@@ -116,12 +115,12 @@ def singularity_map(
         over_place = is_cartesian and mechanism.d > 1  # with one freedom, the point's path is drawn over the joint
         task, positions, names = _choose_axes(extended, over, over_place)
         _check_size(task, cells, len(positions))
-        branches, has_more = _find_branches(task)
+        branches, has_more = find_branches(task)
         steps = ProgressCounter(progress, 1 + len(branches) * 3)
         if over_place:
             domain = _cartesian_domain(task, positions, names, branches, cells)
         else:
-            domain = _joint_domain(task, positions, names, cells)
+            domain = make_joint_domain(task, positions, names, cells)
         steps.add()
         grids = [steps.add_after(fill_grid(domain, branch)) for branch in branches]
         grids = [grid for grid in grids if grid.reached.any()]
@@ -200,21 +199,7 @@ def _check_size(task: Task, cells: int, axes: int) -> None:
         raise InputError(f"cells = {cells}: a map of {mechanism.name} may have at most {limit} along an axis")
 
 
-def _find_branches(task: Task) -> tuple[Array, bool]:
-    """Return a configuration of each branch to map, shape (branches, nq), and whether there are or may be more."""
-    mechanism = task.extended.mechanism
-    if not mechanism.tree.is_euclidean or len(mechanism.dependent) > MAX_DEPENDENT:
-        return mechanism.q_tree[None], True
-    solutions = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).values[0], MAX_BRANCHES + 1)
-    return solutions[:MAX_BRANCHES], len(solutions) > MAX_BRANCHES
-
-
 # --- windows -------------------------------------------------------------------------------------------------------
-
-
-def _joint_domain(task: Task, positions: IntArray, names: Sequence[str], cells: int) -> Domain:
-    axes = tuple(make_joint_axis(task, int(k), name, cells) for k, name in zip(positions, names, strict=True))
-    return Domain(task, positions, axes)
 
 
 def _cartesian_domain(task: Task, positions: IntArray, names: Sequence[str], branches: Array, cells: int) -> Domain:

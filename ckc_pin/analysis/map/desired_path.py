@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.map.grid import Domain, Grid
 from ckc_pin.analysis.map.loci import find_aspects
 from ckc_pin.analysis.map.nearest import find_nearest_singular
 from ckc_pin.base.arrays import Array, BoolArray
@@ -16,6 +15,7 @@ from ckc_pin.control.desired import Desired
 from ckc_pin.control.point_path import PointPath
 from ckc_pin.control.workspace import DesiredCheck, follow_desired
 from ckc_pin.errors import InputError
+from ckc_pin.kinematics.grid import Domain, Grid
 from ckc_pin.kinematics.mapped import Approach, Locus, Path
 from ckc_pin.kinematics.nodes import shape_points
 from ckc_pin.kinematics.sigma import sigma

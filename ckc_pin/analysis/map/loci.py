@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ckc_pin.analysis.map.grid import Domain, Grid, ProgressCounter
 from ckc_pin.analysis.singular_curve import SingularCurve, trace_curve
 from ckc_pin.analysis.singularities import RESIDUAL_TOLERANCE, SingularSystem, classify_solution
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.extended import ExtendedClosure
+from ckc_pin.kinematics.grid import Domain, Grid, ProgressCounter
 from ckc_pin.kinematics.mapped import Kind, Locus
 from ckc_pin.kinematics.nodes import shape_points
 from ckc_pin.mechanism.batch import evaluate_closure

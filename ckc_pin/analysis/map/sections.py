@@ -14,7 +14,12 @@ from time import perf_counter
 import numpy as np
 
 from ckc_pin.analysis.map.compute import add_positions, make_map
-from ckc_pin.analysis.map.grid import (
+from ckc_pin.analysis.map.loci import find_loci
+from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.base.linear_algebra import one_blas_thread
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.extended import Task, extend_closure, find_point
+from ckc_pin.kinematics.grid import (
     COARSE_FRACTION,
     CORNERS,
     SIDES,
@@ -27,11 +32,6 @@ from ckc_pin.analysis.map.grid import (
     flood_grid,
     max_distance,
 )
-from ckc_pin.analysis.map.loci import find_loci
-from ckc_pin.base.arrays import Array, BoolArray
-from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.errors import InputError
-from ckc_pin.kinematics.extended import Task, extend_closure, find_point
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.kinematics.mapped import Axis, SingularityMap
 from ckc_pin.kinematics.nodes import MIN_PIECE, follow, nodes_at

@@ -17,7 +17,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.kinematics.extended import Task
 from ckc_pin.kinematics.mapped import Axis
-from ckc_pin.kinematics.nodes import MIN_PIECE, Nodes, follow, nodes_at
+from ckc_pin.kinematics.nodes import MIN_PIECE, Nodes, find_solutions, follow, nodes_at
 
 __all__ = [
     "COARSE_FRACTION",
@@ -29,11 +29,14 @@ __all__ = [
     "ProgressCounter",
     "cell_centres",
     "fill_grid",
+    "find_branches",
     "flood_grid",
-    "make_joint_axis",
+    "make_joint_domain",
     "max_distance",
 ]
 
+MAX_BRANCHES = 4
+MAX_DEPENDENT = 12  # coordinates; of larger mechanisms, and of free bodies, only the assembled branch is mapped
 COARSE_FRACTION = 0.5  # of the way to a neighbour; cells that need shorter pieces wait until all others are done
 MIN_COARSE_CELLS = 12  # along an axis of a coarse grid
 START_DISTANCE = 1.5  # coarse cells; how far the first cells may be from the first configuration
@@ -121,7 +124,7 @@ class Domain:
         return rows
 
 
-def make_joint_axis(task: Task, k: int, name: str, count: int) -> Axis:
+def _make_joint_axis(task: Task, k: int, name: str, count: int) -> Axis:
     """Return the axis of an independent coordinate.
 
     Its window is a full turn, the joint's limits, or twice the mechanism's size for a slider without limits.
@@ -139,9 +142,24 @@ def make_joint_axis(task: Task, k: int, name: str, count: int) -> Axis:
     return Axis(name, "rad", -np.pi, np.pi, True, cell_centres(-np.pi, np.pi, count))
 
 
+def make_joint_domain(task: Task, positions: IntArray, names: Sequence[str], cells: int) -> Domain:
+    """Return a grid over independent coordinates, which are at some positions in the rows of a task."""
+    axes = tuple(_make_joint_axis(task, int(k), name, cells) for k, name in zip(positions, names, strict=True))
+    return Domain(task, positions, axes)
+
+
 def cell_centres(low: float, high: float, count: int) -> Array:
     """Return the centres of equal cells between two ends."""
     return np.asarray(low + (np.arange(count) + 0.5) * (high - low) / count)
+
+
+def find_branches(task: Task) -> tuple[Array, bool]:
+    """Return a configuration of each branch to map, shape (branches, nq), and whether there are or may be more."""
+    mechanism = task.extended.mechanism
+    if not mechanism.tree.is_euclidean or len(mechanism.dependent) > MAX_DEPENDENT:
+        return mechanism.q_tree[None], True
+    solutions = find_solutions(task, nodes_at(task, mechanism.q_tree[None]).values[0], MAX_BRANCHES + 1)
+    return solutions[:MAX_BRANCHES], len(solutions) > MAX_BRANCHES
 
 
 def max_distance(task: Task) -> float:
