@@ -1,8 +1,8 @@
 """Model-predictive control.
 
-A planner brings the five-bar to its target with the least effort within 0.4 s, and plans again every 20 ms from the
-state that it finds. Gravity does most of the work, and torques stay within 1 N m. After 0.2 s the tip is pushed
-for 60 ms, of which the planner knows nothing. Without planning again, the push would be an error for good.
+A planner brings the five-bar to its target as closely as its motors allow over the next 0.3 s, and plans again every
+20 ms from the state that it finds. After 0.5 s the tip is pushed for 60 ms, of which the planner does not know.
+With the first plan only, the arm falls after its end.
 """
 
 import matplotlib.pyplot as plt
@@ -12,17 +12,18 @@ import ckc_pin
 from ckc_pin.view.style import figure_style
 
 TARGET = {"theta_1": -1.0, "theta_3": -1.9}
-HORIZON, PERIOD, T_END = 0.4, 0.02, 1.2  # s
+HORIZON, PERIOD, T_END = 0.3, 0.02, 1.4  # s
 STEPS = 4  # of constant torque, between two plans
-PUSH, BEGIN, DURATION = [8.0, 0.0, 0.0], 0.2, 0.06  # N, s, s
-LIMIT = 1.0  # N m
+PUSH, BEGIN, DURATION = [8.0, 0.0, 0.0], 0.5, 0.06  # N, s, s
+LIMIT = 2.0  # N m
 
 
 def follow(replan):
     """Return the times, coordinates and torques of a run with plans from each state, or with the first plan only."""
     planner = ckc_pin.Planner(
-        "five_bar", horizon=HORIZON, to={"q": TARGET}, minimize={"effort": 1.0}, limits={"torque": LIMIT}
-    )
+        "five_bar", horizon=HORIZON, minimize={"tracking": 1.0, "effort": 1e-4}, limits={"torque": LIMIT},
+        desired={name: {"offset": x} for name, x in TARGET.items()},
+    )  # fmt: skip
     hand = {"name": "hand", "frame": "tip_left", "force": [0, 0, 0]}
     plant = ckc_pin.Simulator("five_bar/swing", {"force": [hand], "initial": {"at": "equilibrium"}})
     rows, times, plan = [], [], None
@@ -46,7 +47,7 @@ def main():
     error, error_of_one_plan = (np.abs(x[-1, 1:3] - target).max() for x in (closed, once))
     print(f"error at the end {error:.1e} rad; with the first plan only {error_of_one_plan:.2f} rad")
     print(f"a plan took {1e3 * np.median(times):.0f} ms in the median: {1 / np.median(times):.0f} plans per second")
-    assert error < 1e-3 < error_of_one_plan
+    assert error < 1e-2 < error_of_one_plan
     assert np.abs(closed[:, 3:]).max() <= LIMIT
 
     figure, (angles, torques) = plt.subplots(2, sharex=True, layout="constrained")

@@ -155,6 +155,7 @@ def _divide(mesh: Array, intervals: BoolArray) -> Array:
 
 
 def interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
+    """Return a function of times (m,) that interpolates values (k, motors) linearly."""
     return lambda t: np.array([np.interp(t, times, x) for x in values.T]).T.reshape(len(t), -1)
 
 
@@ -362,6 +363,7 @@ def sample_motion(
 
 
 def require_solved(solution: Solution) -> None:
+    """Raise NumericalError with the reason if the optimizer has found no solution."""
     if solution.status in SOLVED:
         return
     label, size = solution.violation
