@@ -379,7 +379,7 @@ def planning(
     raise typer.Exit(planning_trials.main(names, tasks, seed))
 
 
-@app.command(epilog=examples("time_optimal", "time_optimal delta --intervals 200"))
+@app.command("time_optimal", epilog=examples("time_optimal", "time_optimal delta --intervals 200"))
 def time_optimal(
     cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
     intervals: Annotated[int, typer.Option(min=20, help="of the path")] = 1000,
