@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from ckc_pin.mechanism.spec import Loop
     from ckc_pin.optimization.optimize import optimize
     from ckc_pin.optimization.plan import Plan
+    from ckc_pin.optimization.planner import HorizonPlan, Planner
     from ckc_pin.run.events import Event
     from ckc_pin.run.inverse import inverse_dynamics
     from ckc_pin.run.ivp import as_ivp
@@ -90,6 +91,7 @@ __all__ = [
     "Floquet",
     "Force",
     "GainLocus",
+    "HorizonPlan",
     "Identification",
     "InputError",
     "JointServo",
@@ -100,6 +102,7 @@ __all__ = [
     "MotionForces",
     "NumericalError",
     "Plan",
+    "Planner",
     "Point",
     "Run",
     "Sampled",
@@ -148,6 +151,7 @@ MODULES = {
     "Floquet": "sensitivity.floquet",
     "Force": "control.forces",
     "GainLocus": "linear.locus",
+    "HorizonPlan": "optimization.planner",
     "Identification": "identification.result",
     "InputError": "errors",
     "JointServo": "control.joint_servo",
@@ -158,6 +162,7 @@ MODULES = {
     "MotionForces": "run.motion_forces",
     "NumericalError": "errors",
     "Plan": "optimization.plan",
+    "Planner": "optimization.planner",
     "Point": "kinematics.point",
     "Run": "run.run",
     "Sampled": "control.sampled",

@@ -32,7 +32,7 @@ from ckc_pin.optimization.spec import LimitsSpec, MinimizeSpec, OptimizeSpec, Pa
 from ckc_pin.optimization.speed_profile import SpeedProfile
 from ckc_pin.scene.arguments import embed_file
 
-__all__ = ["optimize", "optimize_file"]
+__all__ = ["optimize", "optimize_file", "read_arguments"]
 
 PATH_INTERVALS = 200
 MAX_REFINEMENTS = 40  # of the grid
@@ -91,18 +91,31 @@ def optimize(
     """
     mechanism = as_mechanism(mechanism, "optimize")
     require_callable(progress, "optimize: progress", "a function of the fraction", 1)
+    tables = {"from": start, "to": to, "path": path, "minimize": minimize, "limits": limits, "desired": desired}
+    spec, sources = read_arguments(mechanism, tables, intervals, "optimize")
+    return _optimize(mechanism, spec, sources, progress or (lambda fraction: None))
+
+
+def read_arguments(
+    mechanism: Mechanism, tables: Mapping[str, Any], intervals: int | None, where: str
+) -> tuple[OptimizeSpec, Sources]:
+    """Return the task that the tables of a file, given from Python, describe; those that are None are absent.
+
+    Raises
+    ------
+    InputError
+        Unknown keys or wrong values.
+    """
     data: dict[str, Any] = {"mechanism": mechanism.name}
-    for name, table in (("from", start), ("to", to), ("path", path), ("minimize", minimize), ("limits", limits),
-                        ("desired", desired)):  # fmt: skip
+    for name, table in tables.items():
         if table is not None:
-            require_table(table, f"optimize: {name}", f"a table with the keys of [{name}]")
+            require_table(table, f"{where}: {name}", f"a table with the keys of [{name}]")
             data[name] = _to_data(table)
     if intervals is not None:
         data["intervals"] = intervals
     texts: dict[str, str] = {}
-    embed_file(data.get("desired"), "desired.csv", texts, "optimize: desired.file", reads_paths=True)
-    sources = Sources("optimize", None, texts)
-    return _optimize(mechanism, make_spec(data, sources.name), sources, progress or (lambda fraction: None))
+    embed_file(data.get("desired"), "desired.csv", texts, f"{where}: desired.file", reads_paths=True)
+    return make_spec(data, where), Sources(where, None, texts)
 
 
 def optimize_file(path: str | Path, progress: Callable[[float], None] | None = None) -> Plan:

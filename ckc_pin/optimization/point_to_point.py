@@ -29,7 +29,18 @@ from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measu
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
 
-__all__ = ["plan_between"]
+__all__ = [
+    "EndState",
+    "gauss_places",
+    "guess_motion",
+    "interpolation",
+    "plan_between",
+    "read_desired_motion",
+    "refuse_unsupported",
+    "require_solved",
+    "resolve_state",
+    "sample_motion",
+]
 
 FIRST_INTERVALS = 40
 MAX_MESHES = 16
@@ -75,7 +86,7 @@ def plan_between(
     _require_regular(dynamics, limits, start, end)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
-    motion = _guess_motion(dynamics, spec.minimize, limits, start, end)
+    motion = guess_motion(dynamics, spec.minimize, limits, start, end)
     mesh = base = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
     torque: Callable[[Array], Array] | None = None
     iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
@@ -88,7 +99,7 @@ def plan_between(
         optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
-        _require_solved(solution, limits)
+        require_solved(solution)
         friction.end_mesh()
         plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
         progress((attempt + 1) / MAX_MESHES)
@@ -101,7 +112,7 @@ def plan_between(
         if exceeded.intervals.any() or halves:
             base = _divide(mesh, exceeded.intervals | halves)
         mesh = friction.insert(base, plan)
-        motion, torque = plan.motion, _interpolation(plan.torque_t, plan.torque)
+        motion, torque = plan.motion, interpolation(plan.torque_t, plan.torque)
     if not exceeded.intervals.any():
         return plan
     raise NumericalError(
@@ -123,7 +134,8 @@ def read_desired_motion(
         desired = make_desired(table, mechanism, sources, t_end)
     except InputError as error:
         raise InputError(str(error).replace("controller.desired", "desired")) from None
-    return lambda t: np.array([desired(x)[0] for x in t.tolist()])
+    end = float(getattr(desired, "end", np.inf))
+    return lambda t: np.array([desired(x)[0] for x in np.minimum(t, end).tolist()])
 
 
 def _divide(mesh: Array, intervals: BoolArray) -> Array:
@@ -134,7 +146,8 @@ def _divide(mesh: Array, intervals: BoolArray) -> Array:
     return np.sort(np.concatenate([mesh, ((mesh[1:] + mesh[:-1]) / 2)[halved]]))
 
 
-def _interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
+def interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
+    """Return the function of times (m,) that connects rows (k, columns) by straight lines."""
     return lambda t: np.array([np.interp(t, times, x) for x in values.T]).T.reshape(len(t), -1)
 
 
@@ -236,7 +249,7 @@ def _require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: End
 # --- initial guess -------------------------------------------------------------------------------
 
 
-def _guess_motion(
+def guess_motion(
     dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
 ) -> CoordinateMotion:
     """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
@@ -362,7 +375,8 @@ def sample_motion(
 # --- result --------------------------------------------------------------------------------------
 
 
-def _require_solved(solution: Solution, limits: MotionLimits) -> None:
+def require_solved(solution: Solution) -> None:
+    """Raise NumericalError with the reason if the optimizer has found no optimum."""
     if solution.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
         return
     label, size = solution.violation
@@ -406,7 +420,7 @@ def _assemble(
         raise NumericalError(
             "optimize: stuck: the loops do not close between the points of the mesh; give more intervals"
         )
-    at = dynamics.instants(q_tree, v, a, _interpolation(knots, torque)(t))
+    at = dynamics.instants(q_tree, v, a, interpolation(knots, torque)(t))
     quantities, margin = measure(dynamics, limits, at)
     replay = replay_plan(dynamics, motion, knots, torque, q_tree)
     warnings = []
