@@ -61,13 +61,9 @@ class Ipopt:
         Relative to the scaled problem.
     warm : bool
         Begin close to a solution.
-    barrier : float, optional
-        First barrier parameter of a warm start.
     """
 
-    def __init__(
-        self, program: Program, *, iterations: int, tolerance: float, warm: bool, barrier: float = WARM_BARRIER
-    ) -> None:
+    def __init__(self, program: Program, *, iterations: int, tolerance: float, warm: bool) -> None:
         import casadi as cs
 
         self.program = program
@@ -98,7 +94,7 @@ class Ipopt:
             "acceptable_constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_iter": 5, "mu_strategy": "adaptive",
         }  # fmt: skip
         if warm:
-            settings |= {"warm_start_init_point": "yes", "mu_init": barrier, "mu_strategy": "monotone",
+            settings |= {"warm_start_init_point": "yes", "mu_init": WARM_BARRIER, "mu_strategy": "monotone",
                          "warm_start_bound_push": 1e-8, "warm_start_mult_bound_push": 1e-8}  # fmt: skip
         nlp, grad_f, jac_g, hess = functions
         self._functions = functions

@@ -377,7 +377,7 @@ def sample_motion(
 
 def require_solved(solution: Solution) -> None:
     """Raise NumericalError with the reason if the optimizer has found no optimum."""
-    if solution.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
+    if solution.is_optimum:
         return
     label, size = solution.violation
     if solution.status == "Infeasible_Problem_Detected":
