@@ -460,7 +460,7 @@ class Collocation:
         w = optimum.w
         cost, values = self.constraints(w)
         excess = np.maximum(self.bounds[0] - values, values - self.bounds[1])
-        worst = int(np.argmax(np.where(np.isfinite(excess), excess, np.inf)))
+        worst = int(np.argmax(np.where(np.isnan(excess), np.inf, excess)))
         at = self._instants(w)
         if at is not None:
             self.q_tree = at.q_tree

@@ -61,13 +61,9 @@ class Ipopt:
         Relative to the scaled problem.
     warm : bool
         Begin close to a solution.
-    barrier : float, optional
-        First barrier parameter of a warm start.
     """
 
-    def __init__(
-        self, program: NonlinearProgram, *, iterations: int, tolerance: float, warm: bool, barrier: float = WARM_BARRIER
-    ) -> None:
+    def __init__(self, program: NonlinearProgram, *, iterations: int, tolerance: float, warm: bool) -> None:
         import casadi as cs
 
         self.program = program
@@ -75,14 +71,22 @@ class Ipopt:
         column, none = cs.Sparsity.dense(n, 1), cs.Sparsity(0, 0)
         one, g = cs.Sparsity.dense(1, 1), cs.Sparsity.dense(rows, 1)
         jacobian, hessian = program.jacobian_pattern, program.hessian_pattern
+        variables = {"x": column, "p": none}
+
+        def cost(x: list[Array]) -> Array:
+            return np.array([program.constraints(x[0])[0]])
+
+        def constraints(x: list[Array]) -> Array:
+            return program.constraints(x[0])[1]
+
         functions = [
-            _callback("nlp", {"x": column, "p": none}, {"f": one, "g": g}, lambda x: list(program.constraints(x[0]))),
-            _callback("grad_f", {"x": column, "p": none}, {"f": one, "grad_f_x": column},
-                      lambda x: [program.constraints(x[0])[0], program.gradient(x[0])]),
-            _callback("jac_g", {"x": column, "p": none}, {"g": g, "jac_g_x": jacobian},
-                      lambda x: [program.constraints(x[0])[1], program.jacobian(x[0])]),
-            _callback("hess_lag", {"x": column, "p": none, "lam_f": one, "lam_g": g}, {"triu_hess_gamma_x_x": hessian},
-                      lambda x: [program.hessian(x[0], float(x[2][0]), x[3])]),
+            _callback("nlp", variables, {"f": (one, cost), "g": (g, constraints)}),
+            _callback("grad_f", variables,
+                      {"f": (one, cost), "grad_f_x": (column, lambda x: program.gradient(x[0]))}),
+            _callback("jac_g", variables,
+                      {"g": (g, constraints), "jac_g_x": (jacobian, lambda x: program.jacobian(x[0]))}),
+            _callback("hess_lag", {**variables, "lam_f": one, "lam_g": g},
+                      {"triu_hess_gamma_x_x": (hessian, lambda x: program.hessian(x[0], float(x[2][0]), x[3]))}),
         ]  # fmt: skip
         settings: dict[str, Any] = {
             "print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance,
@@ -90,7 +94,7 @@ class Ipopt:
             "acceptable_constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_iter": 5, "mu_strategy": "adaptive",
         }  # fmt: skip
         if warm:
-            settings |= {"warm_start_init_point": "yes", "mu_init": barrier, "mu_strategy": "monotone",
+            settings |= {"warm_start_init_point": "yes", "mu_init": WARM_BARRIER, "mu_strategy": "monotone",
                          "warm_start_bound_push": 1e-8, "warm_start_mult_bound_push": 1e-8}  # fmt: skip
         nlp, grad_f, jac_g, hess = functions
         self._functions = functions
@@ -128,11 +132,12 @@ def merge_patterns(parts: Sequence[tuple[Any, Any]], rows: int, columns: int) ->
     return cs.Sparsity(rows, columns, starts.tolist(), (keys % rows).tolist()), places
 
 
-def _callback(
-    name: str, inputs: dict[str, Any], outputs: dict[str, Any], evaluate: Callable[[list[Array]], list[Any]]
-) -> Any:
-    """Return a CasADi function that calls a Python function with vectors and takes nonzeros."""
+def _callback(name: str, inputs: dict[str, Any], outputs: dict[str, tuple[Any, Callable[[list[Array]], Array]]]) -> Any:
+    """Return a CasADi function of vectors. Each output has a pattern, and a Python function that gives its nonzeros."""
     import casadi as cs
+
+    patterns, evaluations = zip(*outputs.values(), strict=True)
+    sizes = [pattern.nnz() for pattern in inputs.values()]
 
     class Function(cs.Callback):
         def __init__(self) -> None:
@@ -155,10 +160,17 @@ def _callback(
             return list(inputs.values())[k]
 
         def get_sparsity_out(self, k: int) -> Any:
-            return list(outputs.values())[k]
+            return patterns[k]
 
-        def eval(self, arguments: Sequence[Any]) -> list[Any]:
-            values = evaluate([x.full().ravel() for x in arguments])
-            return [cs.DM(pattern, x) for pattern, x in zip(outputs.values(), values, strict=True)]
+        def has_eval_buffer(self) -> bool:
+            return True
+
+        def eval_buffer(self, arguments: Sequence[memoryview | None], results: Sequence[memoryview | None]) -> int:
+            # An argument of None is zero, and a result of None is not needed.
+            x = [np.zeros(n) if a is None else np.frombuffer(a) for a, n in zip(arguments, sizes, strict=True)]
+            for result, compute in zip(results, evaluations, strict=True):
+                if result is not None:
+                    np.frombuffer(result)[:] = compute(x)
+            return 0
 
     return Function()

@@ -60,6 +60,11 @@ class Solution(Immutable):
     iterations: int
     violation: tuple[str, float]
 
+    @property
+    def is_optimum(self) -> bool:
+        """Whether IPOPT reports a local optimum."""
+        return self.status in ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+
     def motion(self) -> PiecewisePolynomial:
         """Return q over time."""
         values, T = self.values, self.values.duration

@@ -12,7 +12,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.base.linear_algebra import one_blas_thread
-from ckc_pin.base.validation import describe_value, is_number
+from ckc_pin.base.validation import describe_value, is_number, require_table
 from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
@@ -42,7 +42,6 @@ INTERVALS = 20
 MAX_ITERATIONS = 100
 MIN_PART = 0.05  # of the last duration: a free duration is guessed to be at least as long
 TOLERANCE = 1e-6  # of IPOPT, relative to the scaled problem
-BARRIER = 1e-4  # IPOPT's first barrier parameter of a warm start
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,12 +189,15 @@ class Planner:
         self._last = plan, optimum
         return plan
 
-    def _read(self, state: Any) -> tuple[float, Array, Array]:
+    def _read(self, state: State | Mapping[str, Any]) -> tuple[float, Array, Array]:
         if isinstance(state, State):
             return state.t, state.q, state.q_dot
         names, where = self.mechanism.independent, "Planner.solve: state"
-        if not isinstance(state, Mapping) or not set(state) <= {"t", "q", "q_dot"} or "q" not in state:
-            raise InputError(f"{where}: expected a State, or a table with t, q and q_dot, got {describe_value(state)}")
+        require_table(state, where, "a State, or a table with t, q and q_dot")
+        unknown = next((key for key in state if key not in ("t", "q", "q_dot")), None)
+        if unknown is not None or "q" not in state:
+            problem = "'q' is missing" if unknown is None else f"unknown key {unknown!r}"
+            raise InputError(f"{where}: {problem}; give t, q and q_dot")
         q = self.mechanism.vector(state["q"], names, f"{where}.q")
         rates = self.mechanism.vector(state.get("q_dot", {}), names, f"{where}.q_dot", fill=0.0)
         return float(state.get("t", 0.0)), q, rates
@@ -206,7 +208,7 @@ class Planner:
             self._problem = Collocation(self._dynamics, self._limits, self._minimize, guess, self._q_tree,
                                         fixed_duration=self.horizon is not None)  # fmt: skip
             self._cold, self._warm = (
-                Ipopt(self._problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=warm, barrier=BARRIER)
+                Ipopt(self._problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=warm)
                 for warm in (False, True)
             )
         free, end = np.full(self.mechanism.d, np.nan), self._end
@@ -215,8 +217,11 @@ class Planner:
         )
         desired = None if self._desired is None else self._desired(t + guess.duration * gauss_places(self._mesh))
         self._problem.set_ends(ends, desired)
-        optimizer, last = (self._cold, None) if self._last is None else (self._warm, self._last[1])
-        solution, optimum = self._problem.solve(guess, optimizer, last)
+        if self._last is not None:
+            solution, optimum = self._problem.solve(guess, self._warm, self._last[1])
+            if solution.is_optimum:
+                return solution, optimum
+        solution, optimum = self._problem.solve(guess, self._cold)
         require_solved(solution)
         return solution, optimum
 

@@ -54,7 +54,6 @@ GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
-SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")  # statuses of IPOPT
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
 
@@ -104,7 +103,7 @@ def plan_between(
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
         duration = _duration(spec.minimize, limits, RETRY_SLOWER * guess.duration)
-        if attempt == 0 and solution.status not in SOLVED and duration > guess.duration:
+        if attempt == 0 and not solution.is_optimum and duration > guess.duration:
             motion = Slowed(motion, duration)  # The optimizer often succeeds from a slower motion.
             continue
         require_solved(solution)
@@ -155,7 +154,7 @@ def _divide(mesh: Array, intervals: BoolArray) -> Array:
 
 
 def interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
-    """Return a function of times (m,) that interpolates values (k, motors) linearly."""
+    """Return the function of times (m,) that connects rows (k, columns) by straight lines."""
     return lambda t: np.array([np.interp(t, times, x) for x in values.T]).T.reshape(len(t), -1)
 
 
@@ -363,8 +362,8 @@ def sample_motion(
 
 
 def require_solved(solution: Solution) -> None:
-    """Raise NumericalError with the reason if the optimizer has found no solution."""
-    if solution.status in SOLVED:
+    """Raise NumericalError with the reason if the optimizer has found no optimum."""
+    if solution.is_optimum:
         return
     label, size = solution.violation
     if solution.status == "Infeasible_Problem_Detected":
