@@ -40,10 +40,15 @@ def fastest_trapezoids():
     return duration, *torques_of_trapezoids(duration)
 
 
+def plan_fastest():
+    """Plan the fastest motion."""
+    path = {"point": {"plate": PLACES.tolist()}, "shape": "lines", "rounding": 0.01}
+    return ckc_pin.optimize("delta", path=path, limits={"torque": LIMIT})
+
+
 @figure_style()
 def main():
-    path = {"point": {"plate": PLACES.tolist()}, "shape": "lines", "rounding": 0.01}
-    plan = ckc_pin.optimize("delta", path=path, limits={"torque": LIMIT})
+    plan = plan_fastest()
     usual, t, tau = fastest_trapezoids()
     print(f"trapezoidal speeds {1e3 * usual:.0f} ms, fastest {1e3 * plan.t_end:.0f} ms: {usual / plan.t_end:.2f} times")
     assert np.abs(tau).max() <= LIMIT * (1 + 1e-3)

@@ -11,8 +11,9 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.formats.exporting import export, write
-from ckc_pin.view.gif import quantize_frames
+from ckc_pin.view.gif import quantize_frames, save_gif
 from ckc_pin.view.style import COLOURS, GREY, figure_style
+from examples import pick_and_place
 from scripts.experiments.chart import shrink
 
 __all__ = ["main"]
@@ -204,6 +205,12 @@ def moving(path: Path, count: int = 60) -> None:
     first.save(path, save_all=True, append_images=others, duration=80, loop=0)
 
 
+def picking(path: Path) -> None:
+    """Draw the fastest pick-and-place motion of the delta."""
+    run = ckc_pin.simulate(pick_and_place.plan_fastest().scene("open"))
+    save_gif(run, path, speed=0.08, size=(420, 360), fps=20)
+
+
 def main() -> None:
     """Draw all figures."""
     places = {rows: "guide/rows.png", frames: "guide/frames.png", pipeline: "theory/pipeline.png", fmu: "guide/fmu.png"}
@@ -212,8 +219,9 @@ def main() -> None:
         draw().savefig(IMAGES / place)
         shrink(IMAGES / place)
         print(f"written: {IMAGES / place}")
-    moving(IMAGES / "moving.gif")
-    print(f"written: {IMAGES / 'moving.gif'}")
+    for draw_gif, place in ((moving, "moving.gif"), (picking, "guide/pick_and_place.gif")):
+        draw_gif(IMAGES / place)
+        print(f"written: {IMAGES / place}")
 
 
 if __name__ == "__main__":
