@@ -40,7 +40,7 @@ def fastest_trapezoids():
     return duration, *torques_of_trapezoids(duration)
 
 
-def plan_fastest():
+def plan_fastest() -> ckc_pin.Plan:
     """Plan the fastest motion."""
     path = {"point": {"plate": PLACES.tolist()}, "shape": "lines", "rounding": 0.01}
     return ckc_pin.optimize("delta", path=path, limits={"torque": LIMIT})
