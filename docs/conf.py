@@ -1,5 +1,6 @@
 """How Sphinx makes the site; ./scripts/docs runs it. Nothing is fetched, neither to build nor to read it."""
 
+import gc
 import re
 import sys
 from pathlib import Path
@@ -11,6 +12,9 @@ from scripts.site.domain import CkcDomain
 from scripts.site.formulas import setup_formulas
 from scripts.site.insert import inserted
 from scripts.site.search_texts import setup_search
+
+# Trees of documents are large and stay. Looking for garbage among them again and again took a fifth of the time.
+gc.set_threshold(100_000, 50, 50)
 
 project = "ckc_pin"
 author = "the ckc_pin authors"

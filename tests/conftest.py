@@ -137,10 +137,18 @@ def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+def _shared_folder(tmp_path_factory: pytest.TempPathFactory, name: str) -> Path:
+    """Return a folder that all workers of pytest-xdist have in common."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / name
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def writable_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a cache folder for tests that compile terms. Other tests do not use it."""
-    return tmp_path_factory.mktemp("writable_cache")
+    """Return a cache folder for tests that compile terms. Other tests do not use it. All workers share it."""
+    return _shared_folder(tmp_path_factory, "writable_cache")
 
 
 @pytest.fixture(scope="session")
@@ -149,9 +157,7 @@ def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     All workers share it. Each of them starts with another mechanism, and waits if another worker is compiling one.
     """
-    folder, worker = tmp_path_factory.getbasetemp(), os.environ.get("PYTEST_XDIST_WORKER", "")
-    folder = (folder.parent if worker else folder) / "compiled"
-    folder.mkdir(exist_ok=True)
+    folder, worker = _shared_folder(tmp_path_factory, "compiled"), os.environ.get("PYTEST_XDIST_WORKER", "")
     names = deque(["five_bar", "four_bar", "n_four_bar", "slider_crank"])
     names.rotate(2 * int(worker.removeprefix("gw") or 0))
     with pytest.MonkeyPatch.context() as patch:

@@ -32,6 +32,7 @@ MIN_SAMPLES_PER_KNOT = 3.0
 EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
 MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
+GUESS_STEP = 1e-3  # size of the last Gauss-Newton step of configurations that initial guesses are interpolated between
 DIFFERENCE_STEP = 1e-3  # of the largest coordinate, rad or sizes, for J_dot v
 OFF_BRANCH = (
     "the loops do not let the mechanism follow the measured coordinates; they are of another branch (q_guess in the "
@@ -242,7 +243,7 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
     followed = []
     for k in few:
-        here = nearest.solve(here, measured[0, k], f"at t = {instants[k]:.4g} s")
+        here = nearest.solve(here, measured[0, k], f"at t = {instants[k]:.4g} s", GUESS_STEP)
         followed.append(tree.to_coordinates(here.q_tree))
     guess = np.array([np.interp(instants, instants[few], column) for column in np.array(followed).T]).T
     q_tree = nearest.solve_many(guess, measured[0])
@@ -327,8 +328,8 @@ class _Nearest:
             here = self.solve(here, first + (measured - first) * k / steps, "at the first instant")
         return here
 
-    def solve(self, here: Kinematics, measured: Array, when: str) -> Kinematics:
-        """Return the nearest closed configuration, by Gauss-Newton on the constraint manifold."""
+    def solve(self, here: Kinematics, measured: Array, when: str, last_step: float = 1e-10) -> Kinematics:
+        """Return the nearest closed configuration, by Gauss-Newton on the constraint manifold up to a step size."""
         mechanism, tree = self.mechanism, self.mechanism.tree
         for _ in range(MAX_ITERATIONS):
             if not np.all(np.isfinite(here.q_tree)) or here.phi_z_factor.singular:
@@ -338,7 +339,8 @@ class _Nearest:
             missing = (measured - tree.to_coordinates(here.q_tree)[self.at] - closing[self.at]) / self.noise
             step = closing + here.rho @ np.linalg.lstsq(here.rho[self.at] / self.noise[:, None], missing, rcond=None)[0]
             here = here.integrate(step)
-            if tree.step_size(step) <= 1e-10 and np.abs(here.phi).max(initial=0.0) <= mechanism.tolerance:
+            tolerance = max(last_step, mechanism.tolerance)
+            if tree.step_size(step) <= last_step and np.abs(here.phi).max(initial=0.0) <= tolerance:
                 return here
         raise InputError(f"identify: {when} {OFF_BRANCH}")
 

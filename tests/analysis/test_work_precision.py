@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,12 +24,22 @@ from ckc_pin.analysis.precision.reference import Reference, find_confirmed_span,
 from ckc_pin.cli.options import read_overrides
 from ckc_pin.formats.exporting import export
 from ckc_pin.scene.parts import load_scene_mechanism
+from tests.analysis.one_run import time_by_one_run
 from tests.analysis.swing_table import START, pendulum, write_table
 from tests.analytic.five_bar import FIVE_BAR
 from tests.conftest import assert_close
 
 BUDGET_S, FULL_BUDGET_S = 4.0, 60.0  # within the full budget all settings are run
+
+
 ALL_SETTINGS = 4 * (11 + 11 + 6 + 6)  # formulations times tolerances of each method
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_run() -> Iterator[None]:
+    """Time each setting by one run; tests/contract/test_scene_from_python.py repeats runs as users' reports do."""
+    with time_by_one_run():
+        yield
 
 
 @pytest.fixture(scope="module")

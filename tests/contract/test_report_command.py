@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from ckc_pin.cli import report as command
+from tests.analysis.one_run import time_by_one_run
 from tests.analysis.swing_table import SCENE, pendulum, write_table
 from tests.contract.helpers.command import Outcome, ckc
 from tests.contract.helpers.under_way import under_way
@@ -22,6 +24,13 @@ REFERENCE = {"of", "confirmed_by", "rtol", "accuracy", "t_end", "t", "q_tree", "
 ROW = """program formulation method rtol dt overrides status reason error error_q error_v resolved rhs steps used wall_s
          setup_s"""
 ADVICE = {"target", "set", "remove", "reason", "wall_s", "error", "mujoco"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_run() -> Iterator[None]:
+    """Time each setting by one run: no test here depends on how exact the times are."""
+    with time_by_one_run():
+        yield
 
 
 @pytest.fixture
