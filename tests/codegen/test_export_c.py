@@ -28,7 +28,7 @@ from tests.contract.helpers.command import ckc
 MECHANISMS = ["five_bar", "delta", "stewart", "three_rrr", "andrews"]
 REDUNDANT_OR_OPEN = ["bricard", "flyball"]  # a redundant row; no loop at all
 WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
-SANITIZERS = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SANITIZERS = ("-std=c99", "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 EXACT = 1e-11  # relative
 LIBM = {"sin", "cos", "sqrt", "fabs", "fmin", "fmax", "atan2", "tan", "sincos"}  # GCC joins sin and cos
 OK, NOT_CLOSED, SINGULAR, NOT_FINITE = 0, 1, 2, 3
