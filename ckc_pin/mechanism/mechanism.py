@@ -256,6 +256,18 @@ class Mechanism(HasSummary):
         twin.sources = sources
         return twin
 
+    def with_independent(self, names: Sequence[str]) -> Mechanism:
+        """Return an independent copy of the mechanism with other independent coordinates, and the same motors.
+
+        They need not determine the configuration where the mechanism is assembled.
+        """
+        twin = self.copy(self.sources)
+        q = self.tree.indices(tuple(names), "independent")
+        z = np.setdiff1d(np.arange(self.n), q)
+        twin.independent, twin.dependent = tuple(names), tuple(self.coordinates[k] for k in z)
+        twin.partition = Partition(q, z)
+        return twin
+
     # --- one configuration -----------------------------------------------------------------------
 
     def kinematics(self, q_tree: Array) -> Kinematics:

@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath, round_corners
 
-__all__ = ["FreeSpace", "search_path"]
+__all__ = ["MAX_ATTEMPTS", "FreeSpace", "find_path", "is_separated", "search_path", "unlimited_angles"]
 
 MAX_ATTEMPTS = 2000  # random configurations that the trees grow towards
 CLEARANCE = 0.3  # of the smaller sigma_min of the ends: least one of a path that is preferred
@@ -64,6 +64,7 @@ class FreeSpace:
         self.task = Task(extended, extended.joints)
         self.scale = mechanism.tree.step_scale[mechanism.partition.q]
         self._limited = np.flatnonzero(np.isfinite(limits.q).any(axis=0))
+        self._turning = mechanism.tree.q_index[unlimited_angles(mechanism, limits, mechanism.partition.z)]
         self._min_sigma = min_sigma
         if limits.singularity:
             self._min_sigma = max(min_sigma, limits.singularity * float(self.sigma_min(self.node(start))[0]))
@@ -89,6 +90,12 @@ class FreeSpace:
         if self._min_sigma:
             columns.append(self.sigma_min(nodes)[:, None] - self._min_sigma)
         return np.hstack(columns)
+
+    def is_same(self, one: Nodes, other: Nodes) -> BoolArray:
+        """Whether nodes with the same q are the same configurations, up to whole turns of dependent joints."""
+        gap = one.q_tree - other.q_tree
+        gap[:, self._turning] -= 2 * np.pi * np.round(gap[:, self._turning] / (2 * np.pi))
+        return np.asarray(np.abs(gap).max(axis=1) <= MEETING_TOLERANCE)
 
     def length(self, step: Array) -> Array:
         """Return the lengths of steps of q (..., d), in rad or sizes of the mechanism."""
@@ -144,6 +151,13 @@ class FreeSpace:
         return np.array([[place[name] for place in places] for name in names])
 
 
+def unlimited_angles(mechanism: Mechanism, limits: MotionLimits, at: IntArray) -> IntArray:
+    """Return those of some coordinates (places) that are angles of joints without limits."""
+    tree = mechanism.tree
+    return np.array([k for k in at.tolist() if not tree.in_metres[k] and not np.isfinite(limits.q[:, k]).any()
+                     and mechanism.coordinates[k] not in tree.free_coordinates], dtype=np.intp)  # fmt: skip
+
+
 def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array) -> CoordinatePath:
     """Return a path between two closed configurations (nq,), three times differentiable.
 
@@ -164,17 +178,10 @@ def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: A
     NumericalError
         No path was found.
     """
-    space = FreeSpace(mechanism, limits, start)
-    ends = space.node(start), space.node(end)
-    if _is_same(*ends)[0]:
-        return CoordinatePath(PiecewisePolynomial(np.array([0.0, 1.0]), ends[0].values[None], end=1.0), start=start)
-    usual = min(float(space.sigma_min(node)[0]) for node in ends)
-    clear = FreeSpace(mechanism, limits, start, CLEARANCE * usual if mechanism.dependent else 0.0)
-    for within, attempts in ((clear, CLEAR_ATTEMPTS), (space, MAX_ATTEMPTS)):
-        corners = _connect(within, *ends, attempts if mechanism.d > 1 else 0)
-        q = None if corners is None else _round(within, _shorten(within, corners))
-        if q is not None:
-            return CoordinatePath(q, start=start)
+    is_connected = not is_separated(mechanism, limits, start, end)
+    path = find_path(mechanism, limits, start, end) if is_connected else None
+    if path is not None:
+        return path
     if aspects := describe_separation(mechanism, start, end, ("`from`", "`to`")):
         raise InputError(f"optimize: not connected: {aspects}; see `ckc map {mechanism.name}`")
     if mechanism.d == 1:
@@ -186,6 +193,30 @@ def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: A
         f"optimize: stuck: no path from `from` to `to` was found in {MAX_ATTEMPTS} attempts; a limit or a singular "
         "configuration may separate them. Plan in several parts or with wider limits, and see `ckc map`"
     )
+
+
+def is_separated(mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array) -> bool:
+    """Whether det phi_z has different signs at two closed configurations (nq,)."""
+    space = FreeSpace(mechanism, limits, start)
+    return bool(np.sign(space.node(start).det[0]) * np.sign(space.node(end).det[0]) < 0)
+
+
+def find_path(
+    mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array, max_attempts: int = MAX_ATTEMPTS
+) -> CoordinatePath | None:
+    """Return a path as `search_path`, or None after so many attempts."""
+    space = FreeSpace(mechanism, limits, start)
+    ends = space.node(start), space.node(end)
+    if space.is_same(*ends)[0]:
+        return CoordinatePath(PiecewisePolynomial(np.array([0.0, 1.0]), ends[0].values[None], end=1.0), start=start)
+    usual = min(float(space.sigma_min(node)[0]) for node in ends)
+    clear = FreeSpace(mechanism, limits, start, CLEARANCE * usual if mechanism.dependent else 0.0)
+    for within, attempts in ((clear, CLEAR_ATTEMPTS), (space, max_attempts)):
+        corners = _connect(within, *ends, min(attempts, max_attempts) if mechanism.d > 1 else 0)
+        q = None if corners is None else _round(within, _shorten(within, corners))
+        if q is not None:
+            return CoordinatePath(q, start=start)
+    return None
 
 
 # --- trees ---------------------------------------------------------------------------------------
@@ -233,7 +264,7 @@ def _connect(space: FreeSpace, start: Nodes, end: Nodes, attempts: int) -> Nodes
         Random configurations to grow towards. The random numbers are the same in each call.
     """
     reached, arrived = space.follow(start, end.values - start.values)
-    if arrived[0] and _is_same(reached, end)[0]:
+    if arrived[0] and space.is_same(reached, end)[0]:
         return start.joined(end)
     random, box = np.random.default_rng(0), _boxes(space, start, end)
     trees = [_Tree(space, start), _Tree(space, end)]
@@ -247,16 +278,11 @@ def _connect(space: FreeSpace, start: Nodes, end: Nodes, attempts: int) -> Nodes
         targets = active.nodes[numbers]
         ends, arrived = other.grow(targets.values, np.inf)
         for k in np.flatnonzero(arrived):
-            if _is_same(other.nodes[ends[k : k + 1]], targets[k : k + 1])[0]:
+            if space.is_same(other.nodes[ends[k : k + 1]], targets[k : k + 1])[0]:
                 here, there = active.way_to_root(int(numbers[k])), other.way_to_root(int(ends[k]))
                 path = active.nodes[np.array(here[::-1])].joined(other.nodes[np.array(there[1:], dtype=np.intp)])
                 return path if round_ % 2 == 0 else path[np.arange(len(path.values))[::-1]]
     return None
-
-
-def _is_same(one: Nodes, other: Nodes) -> BoolArray:
-    """Whether nodes with the same q are the same configurations."""
-    return np.asarray(np.abs(one.q_tree - other.q_tree).max(axis=1) <= MEETING_TOLERANCE)
 
 
 def _boxes(space: FreeSpace, start: Nodes, end: Nodes) -> list[tuple[Array, Array]]:
@@ -290,7 +316,7 @@ def _shorten(space: FreeSpace, path: Nodes) -> Nodes:
         step = ends[1].values - ends[0].values
         saved = cuts[:, 1] - cuts[:, 0] - space.length(step)
         reached, arrived = space.follow(ends[0], step)
-        saved = np.where(arrived & _is_same(reached, ends[1]), saved, 0.0)
+        saved = np.where(arrived & space.is_same(reached, ends[1]), saved, 0.0)
         best = int(np.argmax(saved))
         if saved[best] > MIN_SAVING * s[-1]:
             first, last = np.arange(pieces[best, 0] + 1), np.arange(pieces[best, 1] + 1, len(s))

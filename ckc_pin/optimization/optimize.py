@@ -29,7 +29,7 @@ from ckc_pin.optimization.path import CoordinatePath, PathMotion, make_path
 from ckc_pin.optimization.plan import Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.point_to_point import plan_between, require_inside, require_regular, resolve_state
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
-from ckc_pin.optimization.spec import LimitsSpec, MinimizeSpec, OptimizeSpec, PathSpec, make_spec, read_optimize
+from ckc_pin.optimization.spec import OptimizeSpec, PathSpec, make_spec, read_optimize
 from ckc_pin.optimization.speed_profile import SpeedProfile
 from ckc_pin.scene.arguments import embed_file
 
@@ -57,6 +57,7 @@ def optimize(
     path: Mapping[str, Any] | None = None,
     minimize: Mapping[str, float] | None = None,
     limits: Mapping[str, Any] | None = None,
+    cross_singularities: bool = False,
     desired: Mapping[str, Any] | None = None,
     intervals: int | None = None,
     progress: Callable[[float], None] | None = None,
@@ -76,6 +77,8 @@ def optimize(
         `to` is searched that keeps the limits and does not reach a singular configuration.
     minimize, limits : mapping, optional
         The keys of ``[minimize]`` and ``[limits]``: ``{"time": 1.0}``, ``{"torque": 3.0, "rate": 5.0}``.
+    cross_singularities : bool
+        Singular configurations may be crossed, as the key of the file.
     desired : mapping, optional
         The motion that ``minimize["tracking"]`` refers to: ``{"file": {"t": t, "theta_1": x, "theta_3": y}}``, or the
         other keys of a tracking controller's ``desired``.
@@ -94,21 +97,21 @@ def optimize(
     mechanism = as_mechanism(mechanism, "optimize")
     require_callable(progress, "optimize: progress", "a function of the fraction", 1)
     tables = {"from": start, "to": to, "path": path, "minimize": minimize, "limits": limits, "desired": desired}
-    spec, sources = read_arguments(mechanism, tables, intervals, "optimize")
+    spec, sources = read_arguments(mechanism, tables, intervals, "optimize", cross_singularities=cross_singularities)
     return _optimize(mechanism, spec, sources, progress or (lambda fraction: None))
 
 
 def read_arguments(
-    mechanism: Mechanism, tables: Mapping[str, Any], intervals: int | None, where: str
+    mechanism: Mechanism, tables: Mapping[str, Any], intervals: int | None, where: str, **keys: Any
 ) -> tuple[OptimizeSpec, Sources]:
-    """Return the task that the tables of a file, given from Python, describe; those that are None are absent.
+    """Return the task that the tables and other keys of a file, from Python, describe; tables of None are absent.
 
     Raises
     ------
     InputError
         Unknown keys or wrong values.
     """
-    data: dict[str, Any] = {"mechanism": mechanism.name}
+    data: dict[str, Any] = {"mechanism": mechanism.name, **keys}
     for name, table in tables.items():
         if table is not None:
             require_table(table, f"{where}: {name}", f"a table with the keys of [{name}]")
@@ -153,7 +156,7 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progre
 
 def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits: MotionLimits) -> Plan:
     """Plan the fastest motion along a path."""
-    _refuse_on_path(spec.minimize, spec.limits, is_free=table.shape == "free")
+    _refuse_on_path(spec, is_free=table.shape == "free")
     dynamics = ReducedDynamics(mechanism)
     path = make_path(table, mechanism) if table.shape != "free" else _find_free_path(dynamics, spec, table, limits)
     motion, sweeps = _refine_profile(dynamics, path, limits, spec.intervals)
@@ -163,13 +166,14 @@ def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limit
             f"optimize: infeasible: limits.time = {limits.time:g} s: the fastest motion takes {t_end:.6g} s"
         )
     t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2))
-    quantities, margin = measure(dynamics, limits, at)
-    replay = replay_plan(dynamics, motion, t, torque, at.q_tree)
+    quantities, margin = measure(mechanism, dynamics, limits, at)
+    replay = replay_plan(mechanism, dynamics, motion, at, t, torque)
     return Plan(
         mechanism=mechanism, status="solved", message="the fastest motion along the path", t_end=t_end,
-        cost=t_end * spec.minimize.time, parts={"time": t_end}, iterations=sweeps, motion=motion, torque_t=t,
-        torque=torque, t=t, quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=path.warnings,
+        cost=t_end * spec.minimize.time, parts={"time": t_end}, iterations=sweeps,
+        coordinates=mechanism.independent, motion=motion, torque_t=t, torque=torque, t=t,
+        quantities=quantities, margin=margin, limits=limits,
+        active=tuple(find_active(limits, t, quantities, margin)), crossings=(), replay=replay, warnings=path.warnings,
     )  # fmt: skip
 
 
@@ -188,7 +192,7 @@ def _find_free_path(
         require_inside(mechanism, limits, state, name)
         if state.rates.any():
             raise InputError(f"optimize: {name}.q_dot: a motion along a path begins and ends at rest; remove it")
-    require_regular(dynamics, limits, start, end)
+    require_regular(mechanism, limits, start, end)
     if not np.any(end.q != start.q):
         raise InputError("optimize: to: the same configuration as `from`; give another one")
     return search_path(mechanism, limits, start.at.q_tree, end.at.q_tree)
@@ -244,7 +248,7 @@ def _exceeds_inside(
     at = np.arange(len(corners) - 1) if which is None else np.flatnonzero(which)
     t = corners[at, None] + np.diff(corners)[at, None] * inside
     instants, missing = _instants(dynamics, motion, t.ravel(), limits)
-    excess = limits.excess(measure(dynamics, limits, instants)[0]).max(axis=1)
+    excess = limits.excess(measure(dynamics.mechanism, dynamics, limits, instants)[0]).max(axis=1)
     exceeded = np.zeros(len(corners) - 1, dtype=bool)
     exceeded[at] = ((excess > 0) | (missing > FORCE_TOLERANCE)).reshape(t.shape).any(axis=1)
     return exceeded
@@ -296,7 +300,10 @@ def _torque_table(
     return t, instants, instants.tau - correction
 
 
-def _refuse_on_path(minimize: MinimizeSpec, limits: LimitsSpec, *, is_free: bool) -> None:
+def _refuse_on_path(spec: OptimizeSpec, *, is_free: bool) -> None:
+    minimize, limits = spec.minimize, spec.limits
+    if spec.cross_singularities:
+        raise InputError("optimize: cross_singularities: a motion along a path stays in its aspect; remove one of them")
     other = [name for name in ("effort", "energy", "jerk", "peak_torque", "tracking") if getattr(minimize, name)]
     if other:
         raise InputError(

@@ -13,6 +13,8 @@ from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
 from ckc_pin.base.tables import to_csv_text, to_data_frame
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
+from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
@@ -26,13 +28,13 @@ if TYPE_CHECKING:
     from ckc_pin.run.run import Run
     from ckc_pin.view.inline import Figures
 
-__all__ = ["ActiveLimit", "CoordinateMotion", "Plan", "Replay", "find_active", "measure", "replay_plan"]
+__all__ = ["ActiveLimit", "CoordinateMotion", "Crossing", "Plan", "Replay", "find_active", "measure", "replay_plan"]
 
 ACTIVE_FRACTION = 0.01  # of a limit's range: a quantity that comes closer makes the limit active
 MERGED_GAP = 0.005  # of the duration: a limit that is left for less counts as active all the time
 REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
 BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
-MAX_SAMPLES = 1_000_000
+BRANCH_TOLERANCE = 1e-6  # rad, m: of coordinates on the branch of the assembled configuration
 
 
 class CoordinateMotion(Protocol):
@@ -53,7 +55,7 @@ class Replay:
     Attributes
     ----------
     error : float
-        Largest difference of the independent coordinates and their rates at the end, SI units.
+        Largest difference of the motion's coordinates and their rates at the end, SI units.
     max_tau : float
         Largest motor torque, N m or N.
     closure : float
@@ -75,6 +77,23 @@ class ActiveLimit:
     end: float
 
 
+@dataclass(frozen=True)
+class Crossing:
+    """A passage through a singular configuration.
+
+    Attributes
+    ----------
+    t : float
+        s.
+    unbalanced : float
+        Force in the direction in which the motors produce least, that the motion needs beyond theirs, relative to the
+        whole force that it needs: 0 up to the error of the plan.
+    """
+
+    t: float
+    unbalanced: float
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(HasSummary):
     """A planned motion with its motor torques.
@@ -91,8 +110,10 @@ class Plan(HasSummary):
         Parts of the cost, without weights: time in s, effort in N² m² s, and so on.
     iterations : int
         Of the optimizer; sweeps of a motion along a path.
+    coordinates : tuple of str
+        Coordinates of `motion`: the independent ones, or others if it crosses singular configurations.
     motion : CoordinateMotion
-        Independent coordinates over time, with rates and accelerations.
+        These coordinates over time, with rates and accelerations.
     torque_t, torque : (k,) and (k, motors) arrays
         Motor torques, linear between the rows.
     t, quantities : (m,) and (m, names) arrays
@@ -101,6 +122,8 @@ class Plan(HasSummary):
         Smallest singular value of phi_z, relative to the start; 1 without loops.
     limits : MotionLimits
     active : tuple of ActiveLimit
+    crossings : tuple of Crossing
+        Passages through singular configurations.
     replay : Replay
     warnings : tuple of str
     """
@@ -112,6 +135,7 @@ class Plan(HasSummary):
     cost: float
     parts: dict[str, float]
     iterations: int
+    coordinates: tuple[str, ...]
     motion: CoordinateMotion
     torque_t: Array
     torque: Array
@@ -120,6 +144,7 @@ class Plan(HasSummary):
     margin: Array
     limits: MotionLimits
     active: tuple[ActiveLimit, ...]
+    crossings: tuple[Crossing, ...]
     replay: Replay
     warnings: tuple[str, ...]
 
@@ -135,8 +160,25 @@ class Plan(HasSummary):
         ----------
         control : "open" or "closed"
             The plan's torques over time, or tracking control (eq. 16) of the plan's motion.
+
+        Raises
+        ------
+        InputError
+            Tracking control of a motion that crosses singular configurations, where eq. 16 has no torques.
         """
-        return _make_scene(self.mechanism, self.motion, self._controller(control), control)
+        if control == "closed" and not self.can_be_tracked:
+            raise InputError(
+                "plan.scene: tracking control (eq. 16) has no torques in the singular configurations that the plan "
+                'crosses; take control = "open"'
+            )
+        n = self.mechanism.n
+        return _make_scene(self.mechanism, self.quantities[0, :n], self.quantities[0, n : 2 * n], self.t_end,
+                           self._controller(control), control, crosses=not self.can_be_tracked)  # fmt: skip
+
+    @property
+    def can_be_tracked(self) -> bool:
+        """Whether the motion is one of the independent coordinates, which tracking control (eq. 16) needs."""
+        return self.coordinates == self.mechanism.independent
 
     def _controller(self, control: str) -> dict[str, Any]:
         if control == "open":
@@ -171,10 +213,13 @@ class Plan(HasSummary):
         return ckc_pin.plot(self)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError)."""
+        """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError).
+
+        A motion that crosses singular configurations has no closed.scene.toml.
+        """
         folder = Path(folder)
-        scenes = [self.scene(name).save(folder, name, overwrite=overwrite or name == "closed")
-                  for name in ("open", "closed")]  # fmt: skip
+        controls = ("open", "closed") if self.can_be_tracked else ("open",)
+        scenes = [self.scene(name).save(folder, name, overwrite=overwrite or name == "closed") for name in controls]
         files = [*scenes, self.to_csv(folder / "plan.csv"), folder / "plan.json"]
         write_atomic(files[-1], to_json(self.to_dict(files)) + "\n")
         return files
@@ -185,6 +230,7 @@ class Plan(HasSummary):
         largest = [f"{name} {np.abs(self.torque[:, k]).max():.4g} {units[f'tau.{name}'].unit}"
                    for k, name in enumerate(self.mechanism.motors.names)]  # fmt: skip
         reached = [f"{x.quantity} {x.side}, {x.begin:.3g} to {x.end:.3g} s" for x in self.active]
+        crossed = [f"at {x.t:.4g} s, unbalanced force {x.unbalanced:.1e}" for x in self.crossings]
         rows: list[Row] = [
             ("status", f"{self.status}: {self.message}"),
             ("duration", f"{self.t_end:.6g} s"),
@@ -192,6 +238,7 @@ class Plan(HasSummary):
             ("iterations", str(self.iterations)),
             ("largest torques", largest),
             ("sigma_min", f"at least {self.margin.min():.3g} of the start's"),
+            *([("crosses singular configurations", crossed)] if crossed else []),
             ("active limits", reached or "none"),
             ("replay", f"error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
              f"closure of the plan {self.replay.closure:.1e}"),
@@ -218,19 +265,28 @@ class Plan(HasSummary):
             "replay": {"error": self.replay.error, "max_tau": self.replay.max_tau, "closure": self.replay.closure},
             "margin": float(self.margin.min()),
             "active": [{"quantity": x.quantity, "side": x.side, "from": x.begin, "to": x.end} for x in self.active],
+            "crossings": [{"t": x.t, "unbalanced": x.unbalanced} for x in self.crossings],
             "warnings": list(self.warnings),
             "files": [path.name for path in files or []],
         }
 
 
-def _make_scene(mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str) -> Scene:
-    """Return the scene of a plan: from its start, with a controller."""
-    names, t_end = mechanism.independent, float(motion.corners[-1])
-    q, rates, _ = motion(np.zeros(1))
-    start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
-             "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
+def _make_scene(
+    mechanism: Mechanism, numbers: Array, rates: Array, t_end: float, controller: dict[str, Any], what: str, *,
+    crosses: bool,
+) -> Scene:  # fmt: skip
+    """Return the scene of a plan: from coordinates and their rates (n,) each, with a controller.
+
+    The DAE of eq. 1 is integrated if the plan crosses singular configurations.
+    """
+    names, at = mechanism.independent, mechanism.partition.q
+    q = dict(zip(names, numbers[at].tolist(), strict=True))
+    assembled = sigma(mechanism, numbers[at], mechanism.assembled)
+    if np.abs(mechanism.tree.to_coordinates(assembled.at.q_tree) - numbers).max() > BRANCH_TOLERANCE:
+        q |= {name: float(x) for name, x in zip(mechanism.coordinates, numbers, strict=True) if name not in q}
     return Scene(
-        mechanism, t_end=t_end, initial=start, controller=controller, name=f"{mechanism.name}, plan, {what} loop",
+        mechanism, t_end=t_end, initial={"q": q, "q_dot": dict(zip(names, rates[at].tolist(), strict=True))},
+        controller=controller, name=f"{mechanism.name}, plan, {what} loop", formulation="dae" if crosses else "reduced",
         solver={"rtol": REPLAY_TOLERANCE, "atol": REPLAY_TOLERANCE, "output_dt": t_end / 200},
     )  # fmt: skip
 
@@ -241,32 +297,40 @@ def _torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[st
     return {"type": "torques", "file": columns, "interpolation": "linear"}
 
 
-def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, torque: Array, q_tree: Array) -> Replay:
+def replay_plan(
+    mechanism: Mechanism, dynamics: ReducedDynamics, motion: CoordinateMotion, at: MotionInstants, t: Array,
+    torque: Array,
+) -> Replay:  # fmt: skip
     """Simulate a plan's torques and compare the end with the plan's.
 
     Parameters
     ----------
+    mechanism : Mechanism
     dynamics : ReducedDynamics
+        In the coordinates of the motion.
     motion : CoordinateMotion
+    at : MotionInstants
+        The motion from its start on.
     t, torque : (k,) and (k, motors) arrays
-    q_tree : (m, nq) array
-        Closed configurations of the plan.
     """
-    mechanism, at = dynamics.mechanism, dynamics.mechanism.partition.q
-    run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque), "open"))
+    numbers, q_at = mechanism.tree.to_coordinates(at.q_tree[0]), dynamics.q_at
+    crosses = dynamics.mechanism.independent != mechanism.independent
+    run = simulate(_make_scene(mechanism, numbers, at.v_tree[0], float(motion.corners[-1]),
+                               _torque_controller(mechanism, t, torque), "open", crosses=crosses))  # fmt: skip
     q, rates, _ = motion(motion.corners[-1:])
-    error = max(np.abs(run.q_tree[-1, at] - q[0]).max(), np.abs(run.v_tree[-1, at] - rates[0]).max())
-    closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
+    error = max(np.abs(run.q_tree[-1, q_at] - q[0]).max(), np.abs(run.v_tree[-1, q_at] - rates[0]).max())
+    closure = float(np.abs(dynamics.residual(at.q_tree)).max(initial=0.0))
     return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
 
 
-def measure(dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants) -> tuple[Array, Array]:
+def measure(
+    mechanism: Mechanism, dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants
+) -> tuple[Array, Array]:
     """Return the quantities of `limits.names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
-    mechanism = dynamics.mechanism
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
     shafts, distances = at.v_tree @ mechanism.motors.transmission.T, dynamics.distances(at.q_tree, limits.spheres)
     quantities = np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, shafts * at.tau, distances])
-    return quantities, dynamics.margins(at.q_tree)
+    return quantities, dynamics.margins(at.q_tree, mechanism.partition.z)
 
 
 def find_active(limits: MotionLimits, t: Array, quantities: Array, margin: Array) -> list[ActiveLimit]:

@@ -18,6 +18,7 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.collocation import Collocation
+from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.ipopt import Ipopt, Optimum
 from ckc_pin.optimization.limits import make_limits
 from ckc_pin.optimization.mesh_motion import Ends, Guess, Solution
@@ -243,7 +244,8 @@ class Planner:
             q=dict(zip(names, q.tolist(), strict=True)), q_dot=dict(zip(names, rates.tolist(), strict=True))
         )
         start = resolve_state(self.mechanism, spec, self.mechanism.assembled, "state")
-        motion = guess_motion(dynamics, self._minimize, limits, start, self._end)
+        path = search_path(self.mechanism, limits, start.at.q_tree, self._end.at.q_tree)
+        motion = guess_motion(dynamics, path, self._minimize, limits, start, self._end)
         return sample_motion(dynamics, limits, motion, mesh, self._q_tree, None)
 
 

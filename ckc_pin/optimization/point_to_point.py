@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -18,17 +19,19 @@ from ckc_pin.kinematics.point import Point
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
+from ckc_pin.optimization.along_path import PathDynamics, find_fastest, minimum_norm_within, path_dynamics
 from ckc_pin.optimization.collocation import TOLERANCE, Collocation
+from ckc_pin.optimization.crossing import find_crossings, find_routes
 from ckc_pin.optimization.dry_friction import FrictionKnots
-from ckc_pin.optimization.free_path import search_path
+from ckc_pin.optimization.free_path import FreeSpace, find_path, is_separated, search_path
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
-from ckc_pin.optimization.path import PathMotion
+from ckc_pin.optimization.path import CoordinatePath, PathMotion
 from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
+from ckc_pin.scene.initial import find_branch
 
 __all__ = [
     "EndState",
@@ -49,12 +52,19 @@ FIRST_INTERVALS = 40
 MAX_MESHES = 16
 MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others are where limits are exceeded
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
+FEW_ITERATIONS = 200  # of it, where other initial guesses may be better
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
+MAX_UNWOUND_RESIDUAL = 1e-9  # m, rad: change of phi by whole turns of dependent joints
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
+EFFORT_GUESS_DURATIONS = (1.0, 2.0, 0.5)  # of initial guesses of minimum effort, relative to a typical one
+WIDER = 10.0  # limits of torques of these guesses, relative to the plan's
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
+
+
+Torques = Callable[[Array], Array]  # motor torques (m, motors) at times (m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +91,59 @@ def plan_between(
     """
     assert spec.to is not None
     refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
+    if spec.cross_singularities:
+        _refuse_with_crossings(spec)
     start = resolve_state(mechanism, spec.start, mechanism.assembled, "from")
     end = resolve_state(mechanism, spec.to, start.at, "to")
     for state, name in ((start, "from"), (end, "to")):
         require_inside(mechanism, limits, state, name)
-    dynamics = ReducedDynamics(mechanism)
-    require_regular(dynamics, limits, start, end)
+    require_regular(mechanism, limits, start, end)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
+    error: NumericalError | None = None
+    for dynamics, motion, torque in _find_guesses(mechanism, spec, limits, (start, end)):
+        try:
+            return _plan_from(mechanism, dynamics, motion, torque, spec, limits, (start, end), desired, progress)
+        except NumericalError as failure:
+            error = error or failure
+    raise error or NumericalError(
+        "optimize: stuck: no path from `from` to `to` was found, also not through singular configurations"
+    )
+
+
+def _find_guesses(
+    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, states: tuple[EndState, EndState]
+) -> Iterator[tuple[ReducedDynamics, CoordinateMotion, Torques | None]]:
+    """Find initial guesses with their torques, or None, and the dynamics in whose coordinates they are.
+
+    One guess along each of the paths comes first, then the next ones.
+    """
+    ends, mesh = (states[0].at.q_tree, states[1].at.q_tree), _first_mesh(spec)
+    if not spec.cross_singularities:
+        routes = [(mechanism, search_path(mechanism, limits, *ends))]
+    else:
+        path = None if is_separated(mechanism, limits, *ends) else find_path(mechanism, limits, *ends)
+        routes = find_routes(mechanism, limits, *ends) if path is None else [(mechanism, path)]
+    along = [(ReducedDynamics(planned), path) for planned, path in routes]
+    each = [_first_guesses(dynamics, path, spec.minimize, limits, states, mesh, crosses=spec.cross_singularities)
+            for dynamics, path in along]  # fmt: skip
+    for row in zip_longest(*each):
+        yield from ((along[k][0], *guess) for k, guess in enumerate(row) if guess is not None)
+
+
+def _first_mesh(spec: OptimizeSpec) -> Array:
+    return np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
+
+
+def _plan_from(
+    mechanism: Mechanism, dynamics: ReducedDynamics, motion: CoordinateMotion, torque: Torques | None,
+    spec: OptimizeSpec, limits: MotionLimits, states: tuple[EndState, EndState],
+    desired: Callable[[Array], Array] | None, progress: Callable[[float], None],
+) -> Plan:  # fmt: skip
+    """Plan a motion from an initial guess."""
+    start, end = (_in_coordinates(dynamics.mechanism, state) for state in states)
+    first_iterations = FEW_ITERATIONS if spec.cross_singularities and torque is None else MAX_ITERATIONS
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
-    motion = guess_motion(dynamics, spec.minimize, limits, start, end)
-    mesh = base = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
-    torque: Callable[[Array], Array] | None = None
+    mesh = base = _first_mesh(spec)
     iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
     for attempt in range(MAX_MESHES):
         guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque)
@@ -99,16 +151,13 @@ def plan_between(
         problem = Collocation(dynamics, limits, spec.minimize, guess, start.at.q_tree,
                               fixed_duration=desired is not None)  # fmt: skip
         problem.set_ends(ends, None if desired is None else desired(limits.time * gauss_places(mesh)))
-        optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
+        optimizer = Ipopt(problem, iterations=MAX_ITERATIONS if attempt else first_iterations, tolerance=TOLERANCE,
+                          warm=attempt > 0)  # fmt: skip
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
-        duration = _duration(spec.minimize, limits, RETRY_SLOWER * guess.duration)
-        if attempt == 0 and not solution.is_optimum and duration > guess.duration:
-            motion = Slowed(motion, duration)  # The optimizer often succeeds from a slower motion.
-            continue
         require_solved(solution)
         friction.end_mesh()
-        plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
+        plan, exceeded = _assemble(mechanism, dynamics, limits, solution, iterations, start)
         progress((attempt + 1) / MAX_MESHES)
         misses = plan.replay.error > REPLAY_ERROR
         halves = misses and not friction.is_present and doublings < MAX_DOUBLINGS
@@ -212,11 +261,50 @@ def resolve_state(mechanism: Mechanism, spec: StateSpec, branch: Kinematics, nam
             raise InputError(f"{where}.point: unreachable: {error}") from None
         return EndState(inverse.at, inverse.q, rates)
     assert spec.q is not None
-    q = mechanism.vector(spec.q, mechanism.independent, f"{where}.q")
+    independent = {key: value for key, value in spec.q.items() if key not in mechanism.dependent}
+    q = mechanism.vector(independent, mechanism.independent, f"{where}.q")
+    if len(independent) < len(spec.q):
+        try:
+            branch = find_branch(mechanism, spec.q)
+        except InputError as error:
+            raise InputError(str(error).replace("initial.q", f"{where}.q")) from None
     solution = sigma(mechanism, q, branch)
     if solution.verdict != "converged":
         raise InputError(f"{where}.q: unreachable: q is {solution.verdict}: {solution.reason}")
-    return EndState(solution.at, q, rates)
+    return EndState(_unwind(solution.at, branch), q, rates)
+
+
+def _unwind(at: Kinematics, reference: Kinematics) -> Kinematics:
+    """Return a configuration with its dependent angles within half a turn of another configuration's.
+
+    Couplings of joints may forbid this. The configuration is returned as it is then.
+    """
+    tree = at.tree
+    angles = [k for k in at.partition.z if not tree.in_metres[k] and tree.coordinates[k] not in tree.free_coordinates]
+    turning = tree.q_index[angles]
+    q_tree = np.array(at.q_tree)
+    q_tree[turning] -= 2 * np.pi * np.round((q_tree - reference.q_tree)[turning] / (2 * np.pi))
+    unwound = Kinematics(tree, at.closure, at.partition, q_tree)
+    is_closed = np.abs(unwound.phi - at.phi).max(initial=0.0) < MAX_UNWOUND_RESIDUAL
+    return unwound if is_closed else at
+
+
+def _in_coordinates(planned: Mechanism, state: EndState) -> EndState:
+    """Return a state in the independent coordinates of another partition."""
+    at = planned.kinematics(state.at.q_tree)
+    v_tree = state.at.rho @ state.rates
+    return EndState(at, planned.independent_part(at.q_tree), v_tree[planned.partition.q])
+
+
+def _refuse_with_crossings(spec: OptimizeSpec) -> None:
+    """Refuse what refers to the independent coordinates or to singular configurations."""
+    for table, names in ((spec.limits, ("singularity", "jerk")), (spec.minimize, ("jerk", "tracking"))):
+        for name in names:
+            if getattr(table, name):
+                where = "limits" if table is spec.limits else "minimize"
+                raise InputError(
+                    f"optimize: {where}.{name}: not supported with cross_singularities; remove one of them"
+                )
 
 
 def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, name: str) -> None:
@@ -245,9 +333,13 @@ def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, 
         )
 
 
-def require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
+def require_regular(mechanism: Mechanism, limits: MotionLimits, start: EndState, end: EndState) -> None:
     """Require that the end is within the limit of singularity (InputError)."""
-    margin = dynamics.margins(np.array([start.at.q_tree, end.at.q_tree]))[1]
+    if not limits.singularity:
+        return
+    space = FreeSpace(mechanism, limits, start.at.q_tree)
+    smallest = [float(space.sigma_min(space.node(state.at.q_tree))[0]) for state in (start, end)]
+    margin = smallest[1] / smallest[0] if mechanism.dependent else 1.0
     if margin < limits.singularity:
         raise InputError(
             f"optimize: to: sigma_min(phi_z) is {margin:.3g} of its value at the start, below limits.singularity = "
@@ -258,26 +350,65 @@ def require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndS
 # --- initial guess -------------------------------------------------------------------------------
 
 
+def _first_guesses(
+    dynamics: ReducedDynamics, path: CoordinatePath, minimize: MinimizeSpec, limits: MotionLimits,
+    states: tuple[EndState, EndState], mesh: Array, *, crosses: bool,
+) -> Iterator[tuple[CoordinateMotion, Torques | None] | None]:  # fmt: skip
+    """Find initial guesses along a path, one after the other, with their torques or None; None if a search fails.
+
+    The optimizer often succeeds from a slower motion, and from one of minimum effort with wider limits of torques.
+    """
+    start, end = (_in_coordinates(dynamics.mechanism, state) for state in states)
+    motion = guess_motion(dynamics, path, minimize, limits, start, end)
+    is_first = not crosses or isinstance(motion.motion, PathMotion)
+    yield (motion, None) if is_first else None
+    duration = _duration(minimize, limits, RETRY_SLOWER * motion.duration)
+    if duration > motion.duration and not crosses:
+        yield Slowed(motion, duration), None
+    ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
+    typical = _typical_duration(_compute_path_terms(dynamics, path), limits, np.median)
+    for duration in dict.fromkeys(_duration(minimize, limits, factor * typical) for factor in EFFORT_GUESS_DURATIONS):
+        wide = replace(limits, torque=limits.torque * WIDER, time=duration)
+        smooth = SmoothMotion(path.q, start.rates, end.rates, duration)
+        guess = sample_motion(dynamics, wide, smooth, mesh, start.at.q_tree, None)
+        problem = Collocation(dynamics, wide, MinimizeSpec(effort=1.0), guess, start.at.q_tree, fixed_duration=True)
+        problem.set_ends(ends)
+        solution, _ = problem.solve(guess, Ipopt(problem, iterations=FEW_ITERATIONS, tolerance=TOLERANCE, warm=False))
+        wide_motion = solution.motion()
+        torque = interpolation(wide_motion.corners, solution.values.torque)
+        yield (wide_motion, torque) if solution.is_optimum else None
+    if not is_first:
+        yield motion, None
+
+
 def guess_motion(
-    dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
-) -> CoordinateMotion:
-    """Return a motion between the ends: the fastest one along a path that the loops can follow, or a smooth one."""
-    path = search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree)
+    dynamics: ReducedDynamics, path: CoordinatePath, minimize: MinimizeSpec, limits: MotionLimits, start: EndState,
+    end: EndState,
+) -> Slowed:  # fmt: skip
+    """Return a motion along a path between the ends: the fastest one, or a smooth one."""
     at_rest = not start.rates.any() and not end.rates.any()
     moves = np.abs(end.q - start.q).max() > 0
-    s = (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2
-    along = path_dynamics(dynamics, path, s)
+    along = _compute_path_terms(dynamics, path)
     if at_rest and moves:
         try:
             profile, _ = find_fastest(dynamics, along, limits)
             return Slowed(PathMotion(path, profile), _duration(minimize, limits, SLOWER * float(profile.t[-1])))
         except (InputError, NumericalError):
             pass
-    force = np.abs(along.inertia).max() * 6
+    duration = _duration(minimize, limits, _typical_duration(along, limits, np.max))
+    return Slowed(SmoothMotion(path.q, start.rates, end.rates, duration), duration)
+
+
+def _compute_path_terms(dynamics: ReducedDynamics, path: CoordinatePath) -> PathDynamics:
+    return path_dynamics(dynamics, path, (1 - np.cos(np.pi * np.linspace(0.0, 1.0, GUESS_PLACES + 1))) / 2)
+
+
+def _typical_duration(along: PathDynamics, limits: MotionLimits, reduce: Callable[[Array], Any]) -> float:
+    """Return about the time that a motion along a path takes, s, by the largest or the median inertia."""
+    force = float(reduce(np.abs(along.inertia).max(axis=1))) * 6
     available = np.where(np.isfinite(limits.torque), np.abs(limits.torque), 0).max(initial=0.0)
     available = available or max(float(np.abs(along.static).max()), 1e-3 * force)
-    duration = _duration(minimize, limits, max(float(np.sqrt(force / available)), 1e-2))
-    return Slowed(SmoothMotion(path.q, start.rates, end.rates, duration), duration)
+    return max(float(np.sqrt(force / available)), 1e-2)
 
 
 def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> float:
@@ -392,9 +523,10 @@ class Exceeded(Immutable):
 
 
 def _assemble(
-    dynamics: ReducedDynamics, limits: MotionLimits, solution: Solution, iterations: int, start: EndState
-) -> tuple[Plan, Exceeded]:
-    mechanism, values = dynamics.mechanism, solution.values
+    mechanism: Mechanism, dynamics: ReducedDynamics, limits: MotionLimits, solution: Solution, iterations: int,
+    start: EndState,
+) -> tuple[Plan, Exceeded]:  # fmt: skip
+    values = solution.values
     motion = solution.motion()
     torque = np.clip(values.torque, *limits.torque)
     knots = motion.corners
@@ -406,9 +538,10 @@ def _assemble(
         raise NumericalError(
             "optimize: stuck: the loops do not close between the points of the mesh; give more intervals"
         )
-    at = dynamics.instants(q_tree, v, a, interpolation(knots, torque)(t))
-    quantities, margin = measure(dynamics, limits, at)
-    replay = replay_plan(dynamics, motion, knots, torque, q_tree)
+    torques = interpolation(knots, torque)
+    at = dynamics.instants(q_tree, v, a, torques(t))
+    quantities, margin = measure(mechanism, dynamics, limits, at)
+    replay = replay_plan(mechanism, dynamics, motion, at, knots, torque)
     warnings = []
     if replay.error > REPLAY_ERROR:
         remedy = "give more intervals"
@@ -417,9 +550,11 @@ def _assemble(
         warnings.append(f"the replay misses the end by {replay.error:.1e}; {remedy}")
     plan = Plan(
         mechanism=mechanism, status="solved", message="a local optimum", t_end=values.duration, cost=solution.cost,
-        parts=solution.parts, iterations=iterations, motion=motion, torque_t=knots, torque=torque, t=t,
-        quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
+        parts=solution.parts, iterations=iterations, coordinates=dynamics.mechanism.independent, motion=motion,
+        torque_t=knots, torque=torque, t=t, quantities=quantities, margin=margin, limits=limits,
+        active=tuple(find_active(limits, t, quantities, margin)),
+        crossings=find_crossings(mechanism, dynamics, motion, t, at, torques), replay=replay,
+        warnings=tuple(warnings),
     )  # fmt: skip
     return plan, _find_excess(limits, quantities, margin)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
@@ -238,7 +238,7 @@ class ReducedDynamics:
 
     def rho(self, q_tree: Array) -> Array:
         """Return rho of eq. 5 at closed configurations, (m, n, d)."""
-        J, _ = self._rates(q_tree, np.zeros((len(q_tree), self.n)))
+        J = self.jacobians(q_tree)
         return self._rho(J, _inverse(J[:, :, self.z_at]))
 
     def _rho(self, J: Array, inverse: Array) -> Array:
@@ -247,16 +247,23 @@ class ReducedDynamics:
         rho[:, self.z_at] = -inverse @ J[:, :, self.q_at]
         return rho
 
-    def smallest_singular_values(self, q_tree: Array) -> Array:
-        """Return smallest singular values of phi_z at configurations (m, nq); 1 without loops."""
-        if not len(self.z_at):
-            return np.ones(len(q_tree))
-        J, _ = self._rates(q_tree, np.zeros((len(q_tree), self.n)))
-        return np.asarray(np.linalg.svd(J[:, :, self.z_at], compute_uv=False)[:, -1], dtype=float)
+    def jacobians(self, q_tree: Array) -> Array:
+        """Return the independent rows of J at configurations (m, nq), (m, rows, n)."""
+        return self._rates(q_tree, np.zeros((len(q_tree), self.n)))[0]
 
-    def margins(self, q_tree: Array) -> Array:
-        """Return smallest singular values of phi_z at configurations, relative to the first; 1 without loops."""
-        smallest = self.smallest_singular_values(q_tree)
+    def smallest_singular_values(self, q_tree: Array, z_at: IntArray | None = None) -> Array:
+        """Return smallest singular values of phi_z at configurations (m, nq); 1 without loops.
+
+        `z_at` are the places of the dependent coordinates, by default those of the motion.
+        """
+        z_at = self.z_at if z_at is None else z_at
+        if not len(z_at):
+            return np.ones(len(q_tree))
+        return np.asarray(np.linalg.svd(self.jacobians(q_tree)[:, :, z_at], compute_uv=False)[:, -1], dtype=float)
+
+    def margins(self, q_tree: Array, z_at: IntArray | None = None) -> Array:
+        """Return the values of `smallest_singular_values`, relative to the first."""
+        smallest = self.smallest_singular_values(q_tree, z_at)
         return smallest / smallest[0]
 
     def distances(self, q_tree: Array, spheres: Sequence[tuple[str, Array, float]]) -> Array:

@@ -34,7 +34,7 @@ class StateSpec(FileStruct, frozen=True, kw_only=True):
     Attributes
     ----------
     q : rad, m
-        Independent coordinates by name.
+        Independent coordinates by name. Dependent ones may be added to select the assembly branch.
         ``q = {theta_1 = -1.2, theta_3 = -1.9}``
     point : m
         Position of one ``[[point]]``, in the working mode of the assembled configuration.
@@ -224,6 +224,10 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
     limits
         Limits of the motion.
         ``limits = {torque = 5.0}``
+    cross_singularities
+        Singular configurations may be crossed, where the independent coordinates do not determine the others and the
+        motors cannot produce every force.
+        ``cross_singularities = true``
     desired
         The motion that ``minimize.tracking`` refers to, as ``desired`` of a scene's tracking controller.
         ``desired = {file = "way.csv"}``
@@ -239,6 +243,7 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
     path: PathSpec | None = None
     minimize: MinimizeSpec = MinimizeSpec(time=1.0)
     limits: LimitsSpec = LimitsSpec()
+    cross_singularities: bool = False
     desired: dict[str, Any] | None = None
     intervals: Annotated[int, msgspec.Meta(ge=4, le=20_000)] | None = None
 

@@ -153,6 +153,8 @@ def draw_plan(plan: Plan) -> Figure:
         ax = slots[2].add_axes()[0]
         limit = plan.limits.singularity or -np.inf
         _draw_between(ax, t, plan.margin, (limit, np.inf), style.COLOURS[0])
+        for crossing in plan.crossings:
+            ax.axvline(crossing.t, color=style.COLOURS[1], lw=0.8, ls=":")
         ax.set_ylim(bottom=0.0)
         ax.set_ylabel(r"$\sigma_{\min}(\varphi_z)$ / start's")
         _finish_axes(ax, {}, 0)

@@ -366,7 +366,7 @@ def importers(fmusim: Annotated[Path, typer.Argument(exists=True, dir_okay=False
 @app.command(epilog=examples("planning", "planning five_bar --tasks 10"))
 def planning(
     cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,
-    tasks: Annotated[int | None, typer.Option(min=1, help="of each case; default: 200 of all cases")] = None,
+    tasks: Annotated[int | None, typer.Option(min=1, help="of each case; default: 270 of all cases")] = None,
     seed: Annotated[int, typer.Option(min=0, help="of the random ends")] = 0,
 ) -> None:
     """Plan random motions from one configuration to another, and replay them.

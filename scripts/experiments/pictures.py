@@ -16,6 +16,7 @@ from ckc_pin.view.identification_figures import draw_identification
 from ckc_pin.view.map_figures import draw_map, draw_sections
 from ckc_pin.view.player import play_runs
 from ckc_pin.view.report_page import render_report
+from ckc_pin.view.result_figures import draw_plan
 from ckc_pin.view.style import figure_style
 from scripts.experiments import identification_trials as trials
 from scripts.experiments.chart import shrink
@@ -67,6 +68,13 @@ def picture_reports(page: Page) -> None:
             page.screenshot(path=IMAGES / "guide" / f"report_{name}.png", full_page=True)
 
 
+def draw_crossing(path: Path, dpi: int) -> None:
+    """Draw the fastest motion of the five-bar to a place beyond a singular configuration."""
+    target = {"theta_1": 1.443, "theta_2": -2.038, "theta_3": 3.352, "theta_4": -2.781}
+    plan = ckc_pin.optimize("five_bar", to={"q": target}, limits={"torque": 3.0}, cross_singularities=True)
+    draw_plan(plan).savefig(path, dpi=dpi)
+
+
 def main(chromium: Path) -> None:
     """Make the pictures of playback, then the figures."""
     IMAGES.mkdir(parents=True, exist_ok=True)
@@ -85,5 +93,6 @@ def main(chromium: Path) -> None:
         draw_sections(workspace_sections("delta")).savefig(IMAGES / "delta_workspace.png", dpi=DPI)
         draw_friction(IMAGES / "five_bar_friction.png", DPI)
         draw_preload(IMAGES / "two_ur5_preload.png", DPI)
-    for picture in [*IMAGES.glob("*.png"), *IMAGES.glob("guide/report_*.png")]:
+        draw_crossing(IMAGES / "guide" / "crossing.png", DPI // 2)
+    for picture in [*IMAGES.glob("*.png"), *IMAGES.glob("guide/report_*.png"), IMAGES / "guide" / "crossing.png"]:
         shrink(picture)

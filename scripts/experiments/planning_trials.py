@@ -1,8 +1,9 @@
 """Random motions from one configuration to another: how many are planned, and why others are not.
 
 Both ends are random configurations in the aspect of the assembled one, to which a straight line in q leads from there,
-and in which the motors can hold the mechanism. Each task is planned from the program's own initial guess and replayed
-in the step loop.
+and in which the motors can hold the mechanism. Motions that cross singular configurations begin at the assembled one
+and end in a random one where det phi_z has the other sign. Each task is planned from the program's own initial guess
+and replayed in the step loop.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 import ckc_pin
 from ckc_pin import Mechanism
 from ckc_pin.base.arrays import Array
-from ckc_pin.optimization.free_path import FreeSpace
+from ckc_pin.kinematics.sigma import sigma
+from ckc_pin.optimization.free_path import FreeSpace, is_separated
 from ckc_pin.optimization.limits import make_limits
 from ckc_pin.optimization.spec import LimitsSpec
 from scripts.experiments.identification_trials import load_case
@@ -41,12 +43,15 @@ class Case:
         rad, or sizes of the mechanism: largest difference of q from the assembled configuration.
     share : float
         Smallest required share of solved tasks.
+    crosses_in : tuple of str
+        Motions cross singular configurations. Their ends are drawn in these coordinates.
     """
 
     tasks: int
     torque: float
     spread: float
     share: float = 0.95
+    crosses_in: tuple[str, ...] = ()
 
 
 CASES = {
@@ -54,6 +59,8 @@ CASES = {
     "delta": Case(40, 5.0, 1.0),
     "leg": Case(20, 3.0, 1.0),
     "three_rrr": Case(20, 1.0, 1.0),
+    "five_bar_crossing": Case(50, 3.0, np.pi, 1.0, ("theta_1", "theta_2")),
+    "three_rrr_crossing": Case(20, 5.0, 1.5, 0.95, ("a_1", "b_1", "c_1")),
 }
 
 
@@ -68,11 +75,18 @@ class TaskResult:
 
 def load(name: str) -> Mechanism:
     """Return the mechanism of a case."""
-    return load_case("leg") if name == "leg" else ckc_pin.load(name)
+    return load_case("leg") if name == "leg" else ckc_pin.load(name.removesuffix("_crossing"))
 
 
-def make_tasks(mechanism: Mechanism, case: Case, count: int, seed: int = 0) -> list[tuple[Array, Array]]:
-    """Return random starts and ends, (d,) arrays each."""
+Configuration = dict[str, float]  # coordinates by name
+
+
+def make_tasks(
+    mechanism: Mechanism, case: Case, count: int, seed: int = 0
+) -> list[tuple[Configuration, Configuration]]:
+    """Return random starts and ends."""
+    if case.crosses_in:
+        return _make_crossings(mechanism, case, count, seed)
     random, ends = np.random.default_rng(seed), list[Array]()
     space = FreeSpace(mechanism, make_limits(LimitsSpec(), mechanism), mechanism.q_tree)
     assembled = space.node(mechanism.q_tree)
@@ -82,15 +96,33 @@ def make_tasks(mechanism: Mechanism, case: Case, count: int, seed: int = 0) -> l
         q = node.values[0]
         if arrived[0] and np.abs(ckc_pin.terms(mechanism, q, 0 * q).h).max() <= MAX_HOLDING_SHARE * case.torque:
             ends.append(q)
-    return list(zip(ends[::2], ends[1::2], strict=True))
+    named = [dict(zip(mechanism.independent, q.tolist(), strict=True)) for q in ends]
+    return list(zip(named[::2], named[1::2], strict=True))
 
 
-def run_task(mechanism: Mechanism, case: Case, start: Array, end: Array) -> TaskResult:
+def _make_crossings(
+    mechanism: Mechanism, case: Case, count: int, seed: int
+) -> list[tuple[Configuration, Configuration]]:
+    random, ends = np.random.default_rng(seed), list[Configuration]()
+    other, limits = mechanism.with_independent(case.crosses_in), make_limits(LimitsSpec(), mechanism)
+    scale, start = mechanism.tree.step_scale[other.partition.q], other.independent_part(mechanism.q_tree)
+    while len(ends) < count:
+        end = sigma(other, start + case.spread * scale * random.uniform(-1, 1, mechanism.d), other.assembled)
+        if end.verdict == "converged" and is_separated(mechanism, limits, mechanism.q_tree, end.at.q_tree):
+            numbers = mechanism.tree.to_coordinates(end.at.q_tree)
+            turned = np.where(mechanism.tree.in_metres, numbers, (numbers + np.pi) % (2 * np.pi) - np.pi)
+            turned[other.partition.q] = numbers[other.partition.q]
+            ends.append(dict(zip(mechanism.coordinates, turned.tolist(), strict=True)))
+    begin = dict(zip(mechanism.independent, mechanism.independent_part(mechanism.q_tree).tolist(), strict=True))
+    return [(begin, end) for end in ends]
+
+
+def run_task(mechanism: Mechanism, case: Case, start: Configuration, end: Configuration) -> TaskResult:
     """Plan a task and check its replay."""
-    names, begin = mechanism.independent, perf_counter()
-    tables = [{"q": dict(zip(names, q.tolist(), strict=True))} for q in (start, end)]
+    begin = perf_counter()
     try:
-        plan = ckc_pin.optimize(mechanism, start=tables[0], to=tables[1], limits={"torque": case.torque})
+        plan = ckc_pin.optimize(mechanism, start={"q": start}, to={"q": end}, limits={"torque": case.torque},
+                                cross_singularities=bool(case.crosses_in))  # fmt: skip
     except ckc_pin.CkcError as error:
         return TaskResult(str(error), perf_counter() - begin)
     seconds = perf_counter() - begin
@@ -99,6 +131,7 @@ def run_task(mechanism: Mechanism, case: Case, start: Array, end: Array) -> Task
         f"replay misses the end by {replay.error:.0e}": replay.error > REPLAY,
         f"closure {replay.closure:.0e}": replay.closure > CLOSURE,
         f"torque {replay.max_tau:.4g}": replay.max_tau > case.torque * (1 + 1e-9),
+        "no crossing": bool(case.crosses_in) and not plan.crossings,
     }
     return TaskResult("; ".join(text for text, fails in checks.items() if fails), seconds, replay.error)
 
