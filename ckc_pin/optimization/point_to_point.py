@@ -52,14 +52,16 @@ FIRST_INTERVALS = 40
 MAX_MESHES = 16
 MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others are where limits are exceeded
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
-FEW_ITERATIONS = 200  # of it, where other initial guesses may be better
+FEW_ITERATIONS = 100  # of it, where other initial guesses may be better
+EFFORT_GUESS_ITERATIONS = 200
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
 MAX_UNWOUND_RESIDUAL = 1e-9  # m, rad: change of phi by whole turns of dependent joints
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
-EFFORT_GUESS_DURATIONS = (1.0, 2.0, 0.5)  # of initial guesses of minimum effort, relative to a typical one
+EFFORT_GUESS_INTERVALS, EFFORT_GUESS_TOLERANCE = 20, 1e-6  # of the coarse mesh of guesses of minimum effort
+EFFORT_GUESS_DURATIONS = (1.0, 0.85, 0.6, 1.4, 2.0)  # of initial guesses of minimum effort, relative to a typical one
 WIDER = 10.0  # limits of torques of these guesses, relative to the plan's
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
@@ -117,21 +119,17 @@ def _find_guesses(
 
     One guess along each of the paths comes first, then the next ones.
     """
-    ends, mesh = (states[0].at.q_tree, states[1].at.q_tree), _first_mesh(spec)
+    ends = states[0].at.q_tree, states[1].at.q_tree
     if not spec.cross_singularities:
         routes = [(mechanism, search_path(mechanism, limits, *ends))]
     else:
         path = None if is_separated(mechanism, limits, *ends) else find_path(mechanism, limits, *ends)
         routes = find_routes(mechanism, limits, *ends) if path is None else [(mechanism, path)]
     along = [(ReducedDynamics(planned), path) for planned, path in routes]
-    each = [_first_guesses(dynamics, path, spec.minimize, limits, states, mesh, crosses=spec.cross_singularities)
+    each = [_first_guesses(dynamics, path, spec.minimize, limits, states, crosses=spec.cross_singularities)
             for dynamics, path in along]  # fmt: skip
     for row in zip_longest(*each):
         yield from ((along[k][0], *guess) for k, guess in enumerate(row) if guess is not None)
-
-
-def _first_mesh(spec: OptimizeSpec) -> Array:
-    return np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
 
 
 def _plan_from(
@@ -143,7 +141,7 @@ def _plan_from(
     start, end = (_in_coordinates(dynamics.mechanism, state) for state in states)
     first_iterations = FEW_ITERATIONS if spec.cross_singularities and torque is None else MAX_ITERATIONS
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
-    mesh = base = _first_mesh(spec)
+    mesh = base = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
     iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
     for attempt in range(MAX_MESHES):
         guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque)
@@ -352,7 +350,7 @@ def require_regular(mechanism: Mechanism, limits: MotionLimits, start: EndState,
 
 def _first_guesses(
     dynamics: ReducedDynamics, path: CoordinatePath, minimize: MinimizeSpec, limits: MotionLimits,
-    states: tuple[EndState, EndState], mesh: Array, *, crosses: bool,
+    states: tuple[EndState, EndState], *, crosses: bool,
 ) -> Iterator[tuple[CoordinateMotion, Torques | None] | None]:  # fmt: skip
     """Find initial guesses along a path, one after the other, with their torques or None; None if a search fails.
 
@@ -370,10 +368,13 @@ def _first_guesses(
     for duration in dict.fromkeys(_duration(minimize, limits, factor * typical) for factor in EFFORT_GUESS_DURATIONS):
         wide = replace(limits, torque=limits.torque * WIDER, time=duration)
         smooth = SmoothMotion(path.q, start.rates, end.rates, duration)
+        mesh = np.linspace(0.0, 1.0, EFFORT_GUESS_INTERVALS + 1)
         guess = sample_motion(dynamics, wide, smooth, mesh, start.at.q_tree, None)
         problem = Collocation(dynamics, wide, MinimizeSpec(effort=1.0), guess, start.at.q_tree, fixed_duration=True)
         problem.set_ends(ends)
-        solution, _ = problem.solve(guess, Ipopt(problem, iterations=FEW_ITERATIONS, tolerance=TOLERANCE, warm=False))
+        solution, _ = problem.solve(
+            guess, Ipopt(problem, iterations=EFFORT_GUESS_ITERATIONS, tolerance=EFFORT_GUESS_TOLERANCE, warm=False)
+        )
         wide_motion = solution.motion()
         torque = interpolation(wide_motion.corners, solution.values.torque)
         yield (wide_motion, torque) if solution.is_optimum else None
