@@ -70,8 +70,11 @@ def test_places_near_singular_configurations_are_followed() -> None:
 def test_no_path_leads_where_another_aspect_is() -> None:
     """A flat parallelogram is singular: the signs of the knee's angle are two aspects."""
     leg = load_case("leg")
+    end = leg.tree.from_coordinates(
+        leg.vector({"hip": -1.2, "knee": -0.4, "support": -0.4, "ankle": 0.4}, leg.coordinates, "end")
+    )
     with pytest.raises(InputError, match=r"not connected: in the map .* `from` is in aspect \d .* another aspect"):
-        optimize(leg, to={"q": {"hip": -1.2, "knee": -0.4}}, limits={"torque": 3.0})
+        search_path(leg, make_limits(LimitsSpec(), leg), leg.q_tree, end)
 
 
 @pytest.mark.parametrize("path", [None, {"shape": "free"}])
