@@ -19,6 +19,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
 from ckc_pin import Mechanism, Run, load, simulate
+from ckc_pin.codegen import compiler
 from ckc_pin.codegen.library import compile_terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
@@ -99,6 +100,9 @@ SLOW_FILES = (
     "contract/test_run_warnings.py",
 )
 
+# Flags of the C compiler: as users have them, and without optimization
+OPTIMIZED = compiler.FLAGS
+QUICK = ("-O0", *(flag for flag in OPTIMIZED if not flag.startswith("-O")))
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
 
 Pair = tuple[Mechanism, FiveBar]
@@ -159,6 +163,14 @@ def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     (cache / "ckc_pin").touch()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_compiler() -> Iterator[None]:
+    """Compile terms with -O0, in a seventh of the time of -O2, for the same numbers. tests/codegen uses -O2."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "FLAGS", QUICK)
         yield
 
 
