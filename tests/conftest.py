@@ -5,9 +5,11 @@ from __future__ import annotations
 import fcntl
 import gc
 import os
+import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
 from ckc_pin import Mechanism, Run, load, simulate
+from ckc_pin.codegen import compiler
 from ckc_pin.codegen.library import compile_terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
@@ -42,52 +45,64 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 SLOW_FILES = (
     "docs/test_snippets.py",
     "identification/test_torques.py",
+    "optimization/test_free_path.py",
+    "codegen/test_export_fmu.py",
+    "codegen/test_export_c.py",
     "ensembles/test_sweep.py",
     "contract/test_cli_signals.py",
     "docs/test_site.py",
     "browser/test_explore_by_hand.py",
     "browser/test_player.py",
     "browser/test_explore_page.py",
-    "analytic/test_desired_motions.py",
+    "optimization/test_state_limits.py",
+    "identification/test_motions.py",
     "sensitivity/test_named_parameters.py",
     "sensitivity/test_compiled_terms.py",
-    "contract/test_experiments.py",
-    "sensitivity/test_control.py",
-    "examples/test_examples.py",
-    "codegen/test_far_masses.py",
-    "identification/test_motions.py",
+    "analytic/test_desired_motions.py",
+    "identification/test_calibration.py",
+    "optimization/test_state_functions.py",
     "identification/test_excitation.py",
-    "analytic/test_prescribed.py",
+    "contract/test_experiments.py",
+    "examples/test_examples.py",
+    "codegen/test_derivatives.py",
+    "analytic/test_map.py",
+    "analytic/test_sections.py",
+    "optimization/test_along_path.py",
+    "codegen/test_far_masses.py",
+    "ensembles/test_damaged_results.py",
+    "optimization/test_point_to_point.py",
     "fuzz/test_fuzz.py",
     "property/test_dynamics.py",
     "regression/test_ivp.py",
     "browser/test_playback.py",
-    "identification/test_calibration.py",
-    "analytic/test_map.py",
     "browser/test_explore_connection.py",
     "browser/test_explore_dragging.py",
-    "codegen/test_derivatives.py",
+    "analytic/test_prescribed.py",
+    "analytic/test_derivatives.py",
+    "codegen/test_c_source.py",
+    "codegen/test_compiled.py",
+    "codegen/test_library.py",
+    "codegen/test_fmu_stops.py",
+    "sensitivity/test_sensitivities.py",
+    "sensitivity/test_couplings.py",
+    "sensitivity/test_control.py",
+    "sensitivity/test_random.py",
     "contract/test_scene_from_python.py",
     "analysis/test_work_precision.py",
-    "codegen/test_compiled.py",
     "contract/test_report_command.py",
-    "analytic/test_derivatives.py",
     "contract/test_sensors.py",
     "joints/test_mechanisms.py",
-    "analytic/test_prescribed_in_part.py",
-    "sensitivity/test_sensitivities.py",
-    "ensembles/test_damaged_results.py",
     "regression/test_inverse_forward.py",
-    "analytic/test_sections.py",
     "property/test_closure.py",
     "contract/test_names.py",
     "contract/test_figures.py",
     "contract/test_map_command.py",
-    "sensitivity/test_couplings.py",
     "contract/test_run_warnings.py",
-    "codegen/test_library.py",
 )
 
+# Flags of the C compiler: as users have them, and without optimization
+OPTIMIZED = compiler.FLAGS
+QUICK = ("-O0", *(flag for flag in OPTIMIZED if not flag.startswith("-O")))
 REFERENCES = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
 
 Pair = tuple[Mechanism, FiveBar]
@@ -127,6 +142,20 @@ def assert_close(ours: Any, theirs: Any, tolerance: float, *, relative: bool = F
         raise AssertionError(f"off by {gap[at]:.3g}, allowed {limit:.3g}: {ours[at]} for {theirs[at]} at {at}")
 
 
+def remember(compute: Callable[..., Any]) -> Callable[..., Any]:
+    """Compute a reference once per process for equal arguments; arrays are compared by their content."""
+    results: dict[bytes, Any] = {}
+
+    @wraps(compute)
+    def recall(*arguments: Any) -> Any:
+        key = pickle.dumps(arguments)
+        if key not in results:
+            results[key] = compute(*arguments)
+        return results[key]
+
+    return recall
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Make the cache of compiled terms empty and unwritable, by a file at the path of its folder."""
@@ -134,6 +163,14 @@ def no_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     (cache / "ckc_pin").touch()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_compiler() -> Iterator[None]:
+    """Compile terms with -O0, in a seventh of the time of -O2, for the same numbers. tests/codegen uses -O2."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "FLAGS", QUICK)
         yield
 
 

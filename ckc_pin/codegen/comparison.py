@@ -30,6 +30,7 @@ __all__ = [
 
 STATES = 25  # compared on the constraint manifold, and as many off it
 STATE_SPREAD = 0.5  # rad, or times the mechanism's size: distance of the states from the assembled configuration
+MAX_HALVINGS = 6  # of the distance of a closed state that the loops do not let the mechanism reach
 TERMS_TOLERANCE = 1e-11  # relative to the largest entry
 DERIVATIVES_TOLERANCE = 1e-6  # derivatives against differences, relative
 DIFFERENCE_STEP = 1e-5  # rad, or times the mechanism's size; for v' in these units per second
@@ -328,10 +329,13 @@ def sample_configurations(mechanism: Mechanism, random: np.random.Generator) -> 
     for k in range(STATES):
         step = STATE_SPREAD * random.uniform(-1, 1, tree.n) * tree.step_scale
         yield mechanism.kinematics(tree.integrate(mechanism.q_tree, step)), False
-        if not mechanism.splits_root:
-            closed = sigma(mechanism, q + STATE_SPREAD * random.uniform(-1, 1, mechanism.d) * reach * 0.9 ** (k % 10))
+        step_q = STATE_SPREAD * random.uniform(-1, 1, mechanism.d) * reach * 0.9 ** (k % 10)
+        for _ in range(0 if mechanism.splits_root else MAX_HALVINGS):
+            closed = sigma(mechanism, q + step_q, anywhere=False)
             if closed.verdict == "converged":
                 yield closed.at, True
+                break
+            step_q = step_q / 2  # A search for configurations beyond singular ones takes longer than all else here.
 
 
 def _require_equal(

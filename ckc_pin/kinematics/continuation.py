@@ -93,7 +93,15 @@ def follow(start: Kinematics, advance: Advance, min_piece: float) -> tuple[Kinem
 
 
 def same_branch(before: Kinematics, after: Kinematics) -> bool:
-    """Whether det phi_z has the same sign in two configurations; True if phi_z is not square."""
-    if before.phi_z.shape[0] != before.phi_z.shape[1]:
-        return True
-    return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
+    """Whether det phi_z has the same sign in two configurations; with redundant rows, whether det(phi_z^+ phi_z') > 0.
+
+    Both are equal if phi_z is square. With redundant rows the determinant is that of phi_z in the column space of its
+    first value, so it is reliable if that space does not turn much: between nearby configurations, and in planar loops.
+    """
+    rows, columns = before.phi_z.shape
+    if rows == columns:
+        return before.phi_z_factor.determinant() * after.phi_z_factor.determinant() > 0
+    if before.phi_z_factor.singular:
+        return False
+    relative = before.phi_z_factor.solve(after.phi_z)
+    return bool(np.linalg.slogdet(relative)[0] > 0)

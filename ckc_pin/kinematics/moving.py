@@ -13,7 +13,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import InputError
-from ckc_pin.kinematics.continuation import follow
+from ckc_pin.kinematics.continuation import follow, same_branch
 from ckc_pin.kinematics.sigma import newton, predict
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import CONSTRAINED_IN_PART, Mechanism
@@ -386,7 +386,7 @@ def _take_step(
         trial = newton(predict(present, part * dq), 0.0, mechanism.tolerance)
         if (
             not trial.converged
-            or not _is_on_branch(present, trial.at)
+            or not same_branch(present, trial.at)
             or trial.at.margin() < min(min_margin, 0.999 * present.margin())
         ):
             return None
@@ -407,17 +407,6 @@ def _take_step(
     if done < 1.0 and end == SINGULAR and reached.margin() > NEARLY_SINGULAR_MARGIN:
         end = "the loops cannot be kept closed any further"
     return reached, done, end if done < 1.0 else ""
-
-
-def _is_on_branch(before: Kinematics, after: Kinematics) -> bool:
-    """Whether no singular configuration separates two nearby configurations: det(phi_z^+ phi_z') > 0.
-
-    It is the sign of det phi_z of both if phi_z is square, and it is defined with redundant rows, too.
-    """
-    if not len(before.partition.z):
-        return True
-    relative = before.phi_z_factor.solve(after.phi_z)
-    return bool(np.linalg.slogdet(relative)[0] > 0)
 
 
 # --- words ---------------------------------------------------------------------------------------

@@ -159,16 +159,12 @@ class FiveBar:
 
     def rho(self, q_tree: Array) -> Array:
         """d q' / d q of eq. 5, (4, 2)."""
-        J = self.J(q_tree)
-        rho = E.astype(J.dtype)
-        rho[Z] = -np.linalg.solve(J[:, Z], J[:, Q])
-        return rho
+        return _rho(self.J(q_tree))
 
     def rho_dot(self, q_tree: Array, v_tree: Array) -> Array:
         """Time derivative of rho where the four angles move with v', (4, 2)."""
-        rho_dot = np.zeros((4, 2), dtype=np.result_type(q_tree, v_tree))
-        rho_dot[Z] = -np.linalg.solve(self.phi_z(q_tree), self.J_dot(q_tree, v_tree) @ self.rho(q_tree))
-        return rho_dot
+        J = self.J(q_tree)
+        return _rho_dot(J, self.J_dot(q_tree, v_tree), _rho(J))
 
     # The reduced model, eq. 6, at any q' (on phi = 0 or off it)
 
@@ -179,18 +175,26 @@ class FiveBar:
 
     def C(self, q_tree: Array, v_tree: Array) -> Array:
         """C of eq. 6, (2, 2), for the tree velocity v'."""
-        rho = self.rho(q_tree)
-        inner = self.D_tree(q_tree) @ self.rho_dot(q_tree, v_tree) + self.C_tree(q_tree, v_tree) @ rho
-        return rho.T @ inner
+        J = self.J(q_tree)
+        rho = _rho(J)
+        rho_dot = _rho_dot(J, self.J_dot(q_tree, v_tree), rho)
+        return rho.T @ (self.D_tree(q_tree) @ rho_dot + self.C_tree(q_tree, v_tree) @ rho)
 
     def h(self, q_tree: Array) -> Array:
         """h of eq. 6, (2,)."""
         return self.rho(q_tree).T @ self.h_tree(q_tree)
 
+    def force(self, q_tree: Array, q_dot: Array, q_ddot: Array) -> Array:
+        """u of eq. 6, (2,), at the tree velocity rho q_dot: D q_ddot + C q_dot + h = rho^T (D' a' + C' v' + h')."""
+        J = self.J(q_tree)
+        rho = _rho(J)
+        v_tree = rho @ q_dot
+        a_tree = rho @ q_ddot + _rho_dot(J, self.J_dot(q_tree, v_tree), rho) @ q_dot
+        return rho.T @ (self.D_tree(q_tree) @ a_tree + self.C_tree(q_tree, v_tree) @ v_tree + self.h_tree(q_tree))
+
     def acceleration(self, q_tree: Array, q_dot: Array, u: Array) -> Array:
         """Second derivative of q by eq. 6, (2,), with the tree velocity rho q_dot."""
-        v_tree = self.rho(q_tree) @ q_dot
-        return np.linalg.solve(self.D(q_tree), u - self.C(q_tree, v_tree) @ q_dot - self.h(q_tree))
+        return np.linalg.solve(self.D(q_tree), u - self.force(q_tree, q_dot, np.zeros(2)))
 
     def acceleration_and_multipliers(self, q_tree: Array, v_tree: Array, u: Array) -> tuple[Array, Array]:
         """Second derivative of q', (4,), and lambda, (2,), of eq. 1 with the closure differentiated twice."""
@@ -264,6 +268,20 @@ def _absolute(angles: Array) -> Array:
 def _columns(b: Array) -> Array:
     """J from what a unit rate of each link's absolute angle does to the end of that link, (2, 4)."""
     return np.array([b[:, 0] + b[:, 1], b[:, 1], -b[:, 2] - b[:, 3], -b[:, 3]]).T
+
+
+def _rho(J: Array) -> Array:
+    """Rho of eq. 5 from J, (4, 2)."""
+    rho = E.astype(J.dtype)
+    rho[Z] = -np.linalg.solve(J[:, Z], J[:, Q])
+    return rho
+
+
+def _rho_dot(J: Array, J_dot: Array, rho: Array) -> Array:
+    """Time derivative of rho, (4, 2)."""
+    rho_dot = np.zeros((4, 2), dtype=np.result_type(J, J_dot))
+    rho_dot[Z] = -np.linalg.solve(J[:, Z], J_dot @ rho)
+    return rho_dot
 
 
 def _wrap(angle: Any) -> Any:

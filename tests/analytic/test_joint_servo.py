@@ -366,9 +366,8 @@ def test_a_servo_beside_a_prescribed_joint() -> None:
         value, v_1 = motion(t)
         q, q_dot = np.array([value, y[0]]), np.array([v_1, y[1]])
         q_tree = FIVE_BAR.sigma(q)
-        v_tree = FIVE_BAR.rho(q_tree) @ q_dot
         e = y[1] - 0.3
-        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.C(q_tree, v_tree) @ q_dot + FIVE_BAR.h(q_tree)
+        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.force(q_tree, q_dot, np.zeros(2))
         a_1 = -1.8 * np.sin(3.0 * t + 0.5)
         return np.array([y[1], (-0.5 * e + y[2] - rest[1] - D[1, 0] * a_1) / D[1, 1], -2.0 * e])
 

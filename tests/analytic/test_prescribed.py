@@ -28,7 +28,7 @@ from ckc_pin import (
 from ckc_pin.control.desired import Harmonics
 from ckc_pin.control.spec import MotionSpec
 from tests.analytic.five_bar import FIVE_BAR, Array
-from tests.conftest import assert_close
+from tests.conftest import assert_close, remember
 
 pytestmark = pytest.mark.usefixtures("either_terms")
 
@@ -59,6 +59,7 @@ def left_crank(t: float) -> tuple[float, float, float]:
     )
 
 
+@remember
 def eliminated(times: Array) -> tuple[Array, Array, Array]:
     """q', v' and the left crank's torque of the reduced model with the left crank's motion inserted by hand."""
 
@@ -66,7 +67,7 @@ def eliminated(times: Array) -> tuple[Array, Array, Array]:
         q_1, q_1_dot, q_1_ddot = left_crank(t)
         q_tree, q_dot = FIVE_BAR.sigma(np.array([q_1, y[0]])), np.array([q_1_dot, y[1]])
         v_tree = FIVE_BAR.rho(q_tree) @ q_dot
-        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.C(q_tree, v_tree) @ q_dot + FIVE_BAR.h(q_tree)
+        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.force(q_tree, q_dot, np.zeros(2))
         q_3_ddot = (-rest[1] - D[1, 0] * q_1_ddot) / D[1, 1]
         return q_tree, v_tree, q_3_ddot, D[0] @ [q_1_ddot, q_3_ddot] + rest[0]
 
@@ -113,7 +114,7 @@ def test_accelerations_and_loop_forces_contain_the_prescribed_motion(formulation
         run.t, run.q_tree, run.v_tree, accelerations, loop_forces, strict=True
     ):
         q_dot = v_tree[[0, 2]]
-        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.C(q_tree, v_tree) @ q_dot + FIVE_BAR.h(q_tree)
+        D, rest = FIVE_BAR.D(q_tree), FIVE_BAR.force(q_tree, q_dot, np.zeros(2))
         q_1_ddot = left_crank(float(t))[2]
         q_ddot = np.array([q_1_ddot, (-rest[1] - D[1, 0] * q_1_ddot) / D[1, 1]])
         a_tree = FIVE_BAR.rho(q_tree) @ q_ddot + FIVE_BAR.rho_dot(q_tree, v_tree) @ q_dot
@@ -319,6 +320,7 @@ def test_harmonics_of_the_test_are_those_of_the_scene() -> None:
     assert_close(np.ravel(ours), np.array(left_crank(0.7)), 1e-12)
 
 
+@pytest.mark.parametrize("either_terms", ["pinocchio"], indirect=True)  # Drawings do not depend on the terms.
 @pytest.mark.parametrize("has_freedom", [False, True])
 def test_prescribed_motions_are_drawn_and_played(tmp_path: Path, has_freedom: bool) -> None:
     """Also without any freedom, where all coordinates are drawn."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ckc_pin import Mechanism
 from ckc_pin.kinematics.sigma import follow_sigma, newton, sigma
 from ckc_pin.mechanism import Psi
 from tests.analytic.five_bar import Array, FiveBar, Q, complex_step
@@ -182,3 +183,34 @@ def test_loops_without_redundant_rows_are_closed_to_the_tolerance_and_no_further
         assert solution.converged
         assert solution.iterations == (0 if open_by <= tolerance else 1)
         assert 1e-8 < np.abs(by_hand.phi(solution.at.q_tree)).max() <= tolerance
+
+
+PARALLELOGRAM = """<robot name="parallelogram"><link name="base"/>
+  {links}
+  <joint name="left" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint>
+  <joint name="elbow" type="continuous"><parent link="a"/><child link="b"/><origin xyz="0.1 0 0"/>
+    <axis xyz="0 0 1"/></joint>
+  <joint name="right" type="continuous"><parent link="base"/><child link="c"/><origin xyz="0.3 0 0"/>
+    <axis xyz="0 0 1"/></joint></robot>"""
+LINK = """<link name="{}"><inertial><mass value="1"/>
+  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.mark.parametrize(("loop", "rows"), [("point_2d", 2), ("hinge", 5)])
+def test_a_path_ends_at_a_flat_parallelogram_with_redundant_rows_too(loop: str, rows: int) -> None:
+    """Both cranks turn by the same angle; det phi_z is proportional to its sine and changes its sign at zero."""
+    mechanism = Mechanism.from_urdf(
+        PARALLELOGRAM.format(links="".join(map(LINK.format, "abc"))),
+        loops=[{"name": "pin", "type": loop, "frame_a": {"link": "b", "xyz": [0.3, 0, 0]},
+                "frame_b": {"link": "c", "xyz": [0.1, 0, 0]}}],
+        q_guess={"left": 1.0, "elbow": -1.0, "right": 1.0},
+        independent=["left"],
+    )  # fmt: skip
+    assert mechanism.assembled.phi_z.shape == (rows, 2)
+    for angle in (0.5, 1e-3, 2.9):
+        assert_close(sigma(mechanism, np.array([angle])).at.q_tree, [angle, -angle, angle], 1e-9)
+    for angle, flat, fraction in ((-0.4, 0.0, 1.0 / 1.4), (3.5, np.pi, (np.pi - 1.0) / 2.5)):
+        solution = sigma(mechanism, np.array([angle]), anywhere=False)
+        assert solution.verdict == "singular"
+        assert solution.reached == pytest.approx(fraction, abs=1e-6)
+        assert_close(solution.at.q_tree, [flat, -flat, flat], 1e-6)

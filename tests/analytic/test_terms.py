@@ -105,3 +105,12 @@ def test_reduced_terms_are_eq_6(pair: Pair) -> None:
         assert_equal(terms.C, reference.C(q, v))
         assert_equal(terms.h, reference.h(q))
         assert_equal(terms.C_times(v[:2]), reference.C(q, v) @ v[:2])
+
+
+def test_force_of_the_reference_is_that_of_its_terms(pair: Pair) -> None:
+    """The reference evaluates D q_ddot + C q_dot + h over the tree for speed."""
+    _, reference = pair
+    q_tree, q_dot, q_ddot = reference.equilibrium() + 0.1, np.array([1.0, -2.0]), np.array([3.0, 0.5])
+    C, h = reference.C(q_tree, reference.rho(q_tree) @ q_dot), reference.h(q_tree)
+    assert_close(reference.force(q_tree, q_dot, q_ddot), reference.D(q_tree) @ q_ddot + C @ q_dot + h, 1e-13)
+    assert_close(reference.acceleration(q_tree, q_dot, reference.force(q_tree, q_dot, q_ddot)), q_ddot, 1e-12)

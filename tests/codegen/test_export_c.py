@@ -40,6 +40,14 @@ def run(*command: object, cwd: Path) -> str:
     return done.stdout
 
 
+def compile_object(name: str, folder: Path, level: str) -> Path:
+    """Return the object file of a mechanism's exported code, compiled once, with the call graph beside it."""
+    file = folder / f"{name}{level}.o"
+    if not file.exists():
+        run("gcc", *WARNINGS, level, "-fPIC", "-fcallgraph-info=su", "-c", f"{name}.c", "-o", file.name, cwd=folder)
+    return file
+
+
 @pytest.fixture(scope="module")
 def folder_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """Return the folder of a shipped mechanism's exported C code, which is written once."""
@@ -74,7 +82,7 @@ class Library:
             _fields_ = (("at", Configuration), ("q_dot", ctypes.c_double * self.d))
 
         self.at, self.motion = Configuration(), Motion()
-        run("gcc", "-std=c99", "-O2", "-fPIC", "-shared", f"{name}.c", "-lm", "-o", "library.so", cwd=folder)
+        run("gcc", "-shared", compile_object(name, folder, "-O2"), "-lm", "-o", "library.so", cwd=folder)
         self._library, self._name = ctypes.CDLL(str(folder / "library.so")), name
         self.model = (ctypes.c_double * size["NUMBERS"])()
         self._library[f"{name}_set_parameters"](
@@ -113,12 +121,13 @@ def test_exported_c_compiles_without_warnings_and_agrees_with_pinocchio(
     name: str, folder_of: Callable[[str], Path]
 ) -> None:
     folder = folder_of(name)
-    run("gcc", *WARNINGS, f"{name}.c", f"{name}_test.c", "-lm", "-o", "vectors", cwd=folder)
+    compiled = compile_object(name, folder, "-O2")
+    run("gcc", *WARNINGS, compiled, f"{name}_test.c", "-lm", "-o", "vectors", cwd=folder)
     report = run("./vectors", cwd=folder)
     ((count, largest),) = re.findall(r"difference at (\d+) states: (\S+)", report)
     assert int(count) >= 20
     assert float(largest) <= EXACT
-    run("gcc", *WARNINGS, f"{name}.c", "main.c", "-lm", "-o", "main", cwd=folder)
+    run("gcc", *WARNINGS, compiled, "main.c", "-lm", "-o", "main", cwd=folder)
     assert run("./main", cwd=folder).count("desired") == load(name).d
 
 
@@ -143,7 +152,8 @@ def test_runner_detects_a_wrong_parameter(folder_of: Callable[[str], Path], tmp_
     assert call in runner
     changed = f"five_bar_parameters p = five_bar_default_parameters; p.link_link_2_mass *= 1.0 + 1e-9; {call}"
     (tmp_path / "wrong.c").write_text(runner.replace(call, changed.replace("&five_bar_default_parameters", "&p")))
-    run("gcc", f"-I{folder}", folder / "five_bar.c", "wrong.c", "-lm", "-o", "wrong", cwd=tmp_path)
+    compiled = compile_object("five_bar", folder, "-O2")
+    run("gcc", f"-I{folder}", compiled, "wrong.c", "-lm", "-o", "wrong", cwd=tmp_path)
     done = subprocess.run(["./wrong"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert float(done.stdout.split()[-1]) > 1e-10
@@ -215,8 +225,7 @@ class CallGraph:
 
     @classmethod
     def of(cls, name: str, folder: Path, level: str) -> CallGraph:
-        run("gcc", "-std=c99", level, "-fcallgraph-info=su", "-c", f"{name}.c", "-o", "graph.o", cwd=folder)
-        text = (folder / "graph.ci").read_text()
+        text = compile_object(name, folder, level).with_suffix(".ci").read_text()
         nodes = re.findall(r'node: \{ title: "([^"]+)" label: "[^"]*?(\d+) bytes \((\w+)\)', text)
         assert {kind for _, _, kind in nodes} == {"static"}
         calls: dict[str, set[str]] = {}
@@ -244,8 +253,8 @@ def test_stack_is_within_the_headers_bound(name: str, level: str, folder_of: Cal
 
 def test_exported_c_has_no_heap_and_no_writable_globals(folder_of: Callable[[str], Path]) -> None:
     folder = folder_of("five_bar")
-    run("gcc", "-std=c99", "-O2", "-c", "five_bar.c", "-o", "symbols.o", cwd=folder)
-    symbols = [line.split()[-2:] for line in run("nm", "symbols.o", cwd=folder).splitlines()]
+    compiled = compile_object("five_bar", folder, "-O2")
+    symbols = [line.split()[-2:] for line in run("nm", compiled, cwd=folder).splitlines()]
     assert {name for kind, name in symbols if kind == "U"} <= LIBM
     assert not [name for kind, name in symbols if kind in "BbDdCc"]
 

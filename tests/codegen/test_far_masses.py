@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from ckc_pin import ensemble, load, sensitivities, simulate
+from ckc_pin.codegen import compiler
 from ckc_pin.codegen.library import compile_terms
 from ckc_pin.mechanism.parameters import values_of
 from ckc_pin.run.prepare import prepare
 from ckc_pin.scene.scene import load_scene
 from tests.analytic.many_digits import ManyDigits, exact
+from tests.conftest import QUICK
 
 SCENES = {"stewart": 0.3, "five_bar/swing": 0.5, "four_bar/turning": 0.5}  # s
 SETS = 6
@@ -24,6 +26,12 @@ STOPPED = {
     "link.cylinder_1.mass": 2e-5, "link.piston_1.mass": 1e-6, "link.cylinder_2.mass": 20.0,
     "link.piston_2.mass": 1e-4, "link.cylinder_4.mass": 3e-4, "link.piston_5.mass": 8e-6,
 }  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def quick_compiler(cache: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile without optimization: rounding errors do not depend on it."""
+    monkeypatch.setattr(compiler, "FLAGS", QUICK)
 
 
 def masses(scene: str, random: np.random.Generator) -> dict[str, float]:

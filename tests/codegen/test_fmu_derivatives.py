@@ -12,9 +12,8 @@ from fmpy.fmi1 import FMICallException
 
 from ckc_pin import Scene, linearize, load_scene, simulate
 from ckc_pin.base.arrays import Array
-from ckc_pin.formats.exporting import export, write
 from ckc_pin.scene.parts import load_scene_mechanism
-from tests.codegen.fmu_instance import Instance
+from tests.codegen.fmu_instance import Instance, write_fmu
 from tests.codegen.test_export_c import make_mechanism
 
 # Central differences are extrapolated to the sixth order.
@@ -50,8 +49,7 @@ class Evaluation(Instance):
     """Model exchange of a scene's FMU at states and inputs."""
 
     def __init__(self, folder: Path, scene: Scene, fmi: str) -> None:
-        (path,) = write(export(scene, "fmu", fmi=fmi), folder)
-        super().__init__(path, "ModelExchange")
+        super().__init__(write_fmu(scene, folder, fmi), "ModelExchange")
         self.knowns = [*self.states, *self.inputs]
 
     def values(self, point: Array) -> Array:

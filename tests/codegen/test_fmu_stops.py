@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -15,10 +16,9 @@ from fmpy.validation import validate_fmu
 
 from ckc_pin import Scene, Simulator, load, load_scene, simulate
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.formats.exporting import export, write
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.scene.parts import load_scene_mechanism
-from tests.codegen.fmu_instance import Instance
+from tests.codegen.fmu_instance import Instance, write_fmu
 from tests.codegen.test_export_c import SANITIZERS, WARNINGS, run
 
 RTOL, SOLVER_TOLERANCE = 1e-11, 1e-10
@@ -64,9 +64,15 @@ def slider_crank(folder: Path, crank: float = -9.0, low: float = 0.22, high: flo
     return Scene(folder, **{"formulation": "reduced", "solver": solver, "t_end": 2.0, "initial": initial, **keys})
 
 
-def export_fmu(scene: Scene, folder: Path, fmi: str) -> Path:
-    (path,) = write(export(scene, "fmu", fmi=fmi), folder)
-    return path
+@pytest.fixture(scope="module")
+def fmu_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
+    """Return the file of a case's FMU, which is written once."""
+
+    @cache
+    def exported(case: str, fmi: str) -> Path:
+        return write_fmu(five_bar(case), tmp_path_factory.mktemp("fmu"), fmi)
+
+    return exported
 
 
 def compare(scene: Scene, path: Path, kind: str, least_events: int, tolerance: float = SOLVER_TOLERANCE) -> None:
@@ -88,17 +94,15 @@ def compare(scene: Scene, path: Path, kind: str, least_events: int, tolerance: f
 
 @pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
 @pytest.mark.parametrize(("case", "fmi"), [("bounces", "2.0"), ("comes to rest", "3.0"), ("both stops at once", "2.0")])
-def test_fmu_hits_stops_as_the_run_does(case: str, fmi: str, kind: str, tmp_path: Path) -> None:
-    scene = five_bar(case)
-    path = export_fmu(scene, tmp_path, fmi)
+def test_fmu_hits_stops_as_the_run_does(case: str, fmi: str, kind: str, fmu_of: Callable[[str, str], Path]) -> None:
+    path = fmu_of(case, fmi)
     assert validate_fmu(str(path)) == []
-    compare(scene, path, kind, SCENES[case][2])
+    compare(five_bar(case), path, kind, SCENES[case][2])
 
 
-def test_stops_hold_joints_at_a_loose_tolerance(tmp_path: Path) -> None:
+def test_stops_hold_joints_at_a_loose_tolerance(fmu_of: Callable[[str, str], Path]) -> None:
     """CVode's errors are larger than the last bounces before the links come to rest."""
-    scene = five_bar("comes to rest", **{"solver.output_dt": 0.1})
-    path, names = export_fmu(scene, tmp_path, "2.0"), ["theta_1", "theta_3"]
+    path, names = fmu_of("comes to rest", "2.0"), ["theta_1", "theta_3"]
     result = fmpy.simulate_fmu(
         str(path), fmi_type="ModelExchange", stop_time=1.0, relative_tolerance=1e-6, output=names
     )
@@ -110,18 +114,17 @@ def test_stops_hold_joints_at_a_loose_tolerance(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["CoSimulation", "ModelExchange"])
 def test_stop_of_a_dependent_coordinate(kind: str, tmp_path: Path) -> None:
     scene = slider_crank(tmp_path / "mechanism")
-    compare(scene, export_fmu(scene, tmp_path, "3.0"), kind, 2)
+    compare(scene, write_fmu(scene, tmp_path, "3.0"), kind, 2)
 
 
 def test_spf_hits_stops_as_the_reduced_model_does(tmp_path: Path) -> None:
-    path = export_fmu(five_bar("comes to rest", formulation="spf", epsilon=1e-3), tmp_path, "2.0")
+    path = write_fmu(five_bar("comes to rest", formulation="spf", epsilon=1e-3), tmp_path, "2.0")
     compare(five_bar("comes to rest"), path, "ModelExchange", 60)
 
 
-def test_torque_lifts_a_link_off_its_stop(tmp_path: Path) -> None:
+def test_torque_lifts_a_link_off_its_stop(fmu_of: Callable[[str, str], Path]) -> None:
     """The reference is a simulator that gets the same torques, constant in each step."""
-    scene = five_bar("comes to rest")
-    simulator, fmu = Simulator(scene), Instance(export_fmu(scene, tmp_path, "2.0"), "CoSimulation")
+    simulator, fmu = Simulator(five_bar("comes to rest")), Instance(fmu_of("comes to rest", "2.0"), "CoSimulation")
     lifted = 0.0
     for k in range(150):
         torque = 0.0 if k < 80 else 12.0 * np.sin(0.1 * (k - 80))
@@ -137,10 +140,9 @@ def test_torque_lifts_a_link_off_its_stop(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fmi", ["2.0", "3.0"])
-def test_impact_obeys_newtons_law(fmi: str, tmp_path: Path) -> None:
+def test_impact_obeys_newtons_law(fmi: str, fmu_of: Callable[[str, str], Path]) -> None:
     """The momentum D q_dot jumps in the direction of the stop, and the rate is reflected with restitution 0.4."""
-    scene = five_bar("bounces")
-    fmu, mechanism = Instance(export_fmu(scene, tmp_path, fmi), "ModelExchange"), load_scene_mechanism(scene)
+    fmu, mechanism = Instance(fmu_of("bounces", fmi), "ModelExchange"), load_scene_mechanism(five_bar("bounces"))
     before = {"theta_1": -1.45, "theta_3": -1.3, "v.theta_1": -2.0, "v.theta_3": 0.7}
     fmu.set_states(np.array([before[x] for x in fmu.states]))
     fmu.fmu.enterEventMode()
@@ -152,10 +154,9 @@ def test_impact_obeys_newtons_law(fmi: str, tmp_path: Path) -> None:
     assert (terms.D @ jump)[1] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_start_beyond_a_stop_is_refused(tmp_path: Path) -> None:
-    path = export_fmu(five_bar("bounces"), tmp_path, "2.0")
+def test_start_beyond_a_stop_is_refused(fmu_of: Callable[[str, str], Path]) -> None:
     assert "a joint is beyond its stop: choose start values within the stops" in failing_messages(
-        path, {"theta_1": -1.5}
+        fmu_of("bounces", "2.0"), {"theta_1": -1.5}
     )
 
 
@@ -172,18 +173,18 @@ SLIDER = float(sigma(load("slider_crank"), np.array([1.3])).at.q_tree[2])  # whi
 
 def test_joints_that_move_together_hit_their_stops_together(tmp_path: Path) -> None:
     scene = slider_crank(tmp_path / "mechanism", crank=1.3, high=SLIDER, t_end=0.2)
-    compare(scene, export_fmu(scene, tmp_path, "2.0"), "CoSimulation", 2)
+    compare(scene, write_fmu(scene, tmp_path, "2.0"), "CoSimulation", 2)
 
 
 def test_stops_that_jam_a_mechanism_are_an_error(tmp_path: Path) -> None:
     """Neither the crank nor the slider can leave its stop."""
     scene = slider_crank(tmp_path / "mechanism", crank=1.3, low=SLIDER)
-    (message,) = failing_messages(export_fmu(scene, tmp_path, "2.0"), {})
+    (message,) = failing_messages(write_fmu(scene, tmp_path, "2.0"), {})
     assert message.startswith("joints that only move together touch several stops at once")
 
 
-def test_fmu_has_no_warnings_and_no_undefined_behaviour(tmp_path: Path) -> None:
-    with ZipFile(export_fmu(five_bar("comes to rest"), tmp_path, "2.0")) as archive:
+def test_fmu_has_no_warnings_and_no_undefined_behaviour(tmp_path: Path, fmu_of: Callable[[str, str], Path]) -> None:
+    with ZipFile(fmu_of("comes to rest", "2.0")) as archive:
         archive.extractall(tmp_path)
     run("gcc", *WARNINGS, "-c", "sources/fmi2.c", "-o", "fmu.o", cwd=tmp_path)
     harness = Path(__file__).parent / "fmu_harness.c"

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from ckc_pin import InputError, NumericalError, Sampled, Terms, simulate
 from ckc_pin.scene.parts import build_scene_controller, load_scene_mechanism
 from ckc_pin.scene.scene import load_scene
-from tests.analytic.five_bar import FIVE_BAR, Array, Controller, Q, set_point, tracking
-from tests.conftest import assert_close
+from tests.analytic.five_bar import FIVE_BAR, Array, Q, set_point, tracking
+from tests.conftest import assert_close, remember
 from tests.contract.helpers.bad import Bad, expect
 
 pytestmark = pytest.mark.usefixtures("either_terms")
@@ -24,7 +24,8 @@ LAWS = {"set_point": set_point(FIVE_BAR, TARGET), "tracking": tracking(FIVE_BAR)
 START = FIVE_BAR.equilibrium()[Q]
 
 
-def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Array, Array, Array]:
+@remember
+def loop(scene: str, period: float, delay: float, t_end: float) -> tuple[Array, Array, Array]:
     """Return instants at which u changes or is computed, (q, q_dot) there, and the u applied from then on.
 
     u acts at t with the newest k for which k period + delay <= t.
@@ -36,7 +37,7 @@ def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Ar
     for k, t in enumerate(instants):
         q_tree = FIVE_BAR.sigma(y[:2])
         if len(computed) * period <= t + 1e-12:
-            computed.append(law(t, q_tree, y[2:]))
+            computed.append(LAWS[scene](t, q_tree, y[2:]))
         newest = int(np.floor((t - delay) / period + 1e-6))
         u = computed[newest] if newest >= 0 else np.zeros(2)
         states.append(y)
@@ -63,7 +64,7 @@ def loop(law: Controller, period: float, delay: float, t_end: float) -> tuple[Ar
 )
 def test_sampled_control_agrees_with_numpy(scene: str, period: float, delay: float, formulation: str) -> None:
     t_end = 15 * period
-    instants, states, acts = loop(LAWS[scene], period, delay, t_end)
+    instants, states, acts = loop(scene, period, delay, t_end)
     overrides = {
         "formulation": formulation,
         "t_end": t_end,

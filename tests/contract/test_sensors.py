@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from ckc_pin import InputError, NumericalError, Run, Sampled, Terms, simulate
 from tests.analytic.five_bar import FIVE_BAR, Array, Q, set_point, tracking
-from tests.conftest import assert_close
+from tests.conftest import assert_close, remember
 from tests.contract.helpers.bad import Bad, expect
 
 pytestmark = pytest.mark.usefixtures("either_terms")
@@ -106,6 +106,14 @@ def loop(
     return np.array(states), np.array(torques)
 
 
+@remember
+def shipped_loop(
+    scene: str, period: float, keys: dict[str, Any], count: int, late: int = 0, largest: Any = np.inf, step: Any = 0.0
+) -> tuple[Array, Array]:
+    """Return `loop` with the controller of a scene and a sensor with these keys."""
+    return loop(LAWS[scene], Seen(period, **keys), count, late, largest, step)
+
+
 def assert_is(run: Run, states: Array, torques: Array) -> None:
     assert run.status == "done", run.message
     assert len(run.t) == len(states)
@@ -146,7 +154,7 @@ def test_sensors_agree_with_numpy(scene: str, name: str) -> None:
         "controller.sensor": table(keys),
     }
     run = simulate(f"five_bar/{scene}", overrides)
-    assert_is(run, *loop(LAWS[scene], Seen(period, **keys), 33))
+    assert_is(run, *shipped_loop(scene, period, keys, 33))
     exact = simulate(f"five_bar/{scene}", {**overrides, "controller.sensor": None})
     assert np.abs(run.tau - exact.tau).max() > 1e-3
     assert run.stats["python_calls"] == 0
@@ -177,10 +185,9 @@ def test_drives_agree_with_numpy(formulation: str, name: str) -> None:
     run = simulate("five_bar/set_point", overrides)
     rate, step = keys.get("torque_rate", np.inf), np.array(keys.get("torque_resolution", 0.0))
     step = np.where(step > 0, step, 1e-300)  # floor(x / 1e-300) overflows nothing here, and changes nothing
-    law, seen = LAWS["set_point"], Seen(period, resolution=1e-3)
     if np.all(step == 1e-300):
         step = 0.0
-    states, torques = loop(law, seen, 41, 2, rate, step)
+    states, torques = shipped_loop("set_point", period, {"resolution": 1e-3}, 41, 2, rate, step)
     assert_is(run, states, torques)
     assert np.abs(run.tau).max() > 1.0
 

@@ -1,4 +1,4 @@
-"""Compile terms of pages into a cache of their own, which other tests do not use."""
+"""Compile without optimization, and terms of pages into a cache of their own, which other tests do not use."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from ckc_pin.analysis.map import loci
+from ckc_pin.formats.fmu import writer
+from tests.conftest import QUICK
+
 
 @pytest.fixture(autouse=True)
 def cache(writable_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(writable_cache))
+    monkeypatch.setattr(writer, "FLAGS", QUICK)
+    monkeypatch.setattr(loci, "CURVE_STEP", 0.15)  # fewer points of curves, which are as accurate

@@ -73,7 +73,7 @@ def time_stepping(q_tree: Array, duration: float, steps: int) -> Array:
     for _ in range(steps):
         there = FIVE_BAR.sigma(q)
         rho, D = FIVE_BAR.rho(there), FIVE_BAR.D(there)
-        free = q_dot - h * np.linalg.solve(D, FIVE_BAR.C(there, rho @ q_dot) @ q_dot + FIVE_BAR.h(there))
+        free = q_dot - h * np.linalg.solve(D, FIVE_BAR.force(there, q_dot, np.zeros(2)))
         # the impulses within their bounds that minimize the kinetic energy: joints stick if they can
         root = np.linalg.cholesky(np.linalg.inv(D))
         impulses = lsq_linear(

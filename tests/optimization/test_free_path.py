@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +14,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.optimization.free_path import FreeSpace, search_path
 from ckc_pin.optimization.limits import make_limits
+from ckc_pin.optimization.path import CoordinatePath
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import KeepOutSpec, LimitsSpec, SphereSpec
 from scripts.experiments.identification_trials import load_case
@@ -37,11 +39,17 @@ def places(plan: Plan, count: int = 2000) -> Array:
     return plan.motion(np.linspace(0.0, plan.t_end, count))[0]
 
 
-@pytest.mark.parametrize("target", HIDDEN)
-def test_a_path_leads_around_singular_configurations(target: list[float]) -> None:
+@cache
+def path_to(*target: float) -> CoordinatePath:
+    """Return the five-bar's path without limits from the assembled configuration."""
     five_bar = load("five_bar")
     end = sigma(five_bar, np.array(target)).at.q_tree
-    path = search_path(five_bar, make_limits(LimitsSpec(), five_bar), five_bar.q_tree, end)
+    return search_path(five_bar, make_limits(LimitsSpec(), five_bar), five_bar.q_tree, end)
+
+
+@pytest.mark.parametrize("target", HIDDEN)
+def test_a_path_leads_around_singular_configurations(target: list[float]) -> None:
+    five_bar, path = load("five_bar"), path_to(*target)
     s = np.linspace(0.0, 1.0, 5001)
     start = five_bar.q_tree[[0, 2]]
     straight = [sine(start + x * (target - start)) for x in s]
@@ -70,8 +78,11 @@ def test_places_near_singular_configurations_are_followed() -> None:
 def test_no_path_leads_where_another_aspect_is() -> None:
     """A flat parallelogram is singular: the signs of the knee's angle are two aspects."""
     leg = load_case("leg")
+    end = leg.tree.from_coordinates(
+        leg.vector({"hip": -1.2, "knee": -0.4, "support": -0.4, "ankle": 0.4}, leg.coordinates, "end")
+    )
     with pytest.raises(InputError, match=r"not connected: in the map .* `from` is in aspect \d .* another aspect"):
-        optimize(leg, to={"q": {"hip": -1.2, "knee": -0.4}}, limits={"torque": 3.0})
+        search_path(leg, make_limits(LimitsSpec(), leg), leg.q_tree, end)
 
 
 @pytest.mark.parametrize("path", [None, {"shape": "free"}])
@@ -120,14 +131,14 @@ def test_a_dependent_coordinate_stays_within_its_limits() -> None:
     five_bar = load("five_bar")
     end = sigma(five_bar, np.array(HIDDEN[0])).at.q_tree
 
-    def angles(limits: LimitsSpec) -> Array:
-        path = search_path(five_bar, make_limits(limits, five_bar), five_bar.q_tree, end)
+    def angles(path: CoordinatePath) -> Array:
         return np.unwrap([FIVE_BAR.sigma(x)[1] for x in path.q(np.linspace(0, 1, 3000))[0]])
 
-    free = angles(LimitsSpec())
+    free = angles(path_to(*HIDDEN[0]))
     bound = (float(free.max()) + float(free[[0, -1]].max())) / 2
     assert free.max() > bound + 0.02
-    assert angles(LimitsSpec(q={"theta_2": (-10.0, bound)})).max() < bound + 1e-4
+    limits = make_limits(LimitsSpec(q={"theta_2": (-10.0, bound)}), five_bar)
+    assert angles(search_path(five_bar, limits, five_bar.q_tree, end)).max() < bound + 1e-4
 
 
 def test_the_path_around_a_disc_is_nearly_the_shortest() -> None:

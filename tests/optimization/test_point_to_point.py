@@ -79,8 +79,7 @@ def least_effort(start: Array, end: Array, time: float) -> float:
         rows = []
         for one, rate, acceleration, weight in zip(q + start, v, a, w, strict=True):
             q_tree = model.sigma(one)
-            v_tree = model.rho(q_tree) @ rate
-            u = model.D(q_tree) @ acceleration + model.C(q_tree, v_tree) @ rate + model.h(q_tree)
+            u = model.force(q_tree, rate, acceleration)
             rows.append(np.sqrt(weight) * u)
         return np.concatenate(rows)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import casadi as cs
 import numpy as np
 import pytest
@@ -15,6 +17,11 @@ from ckc_pin.optimization.state_functions import ExpressionFunctions, SmallestSi
 from tests.property.mechanisms import closed_mechanism
 
 STEP = 1e-5
+
+
+@cache
+def dynamics_of(name: str) -> ReducedDynamics:
+    return ReducedDynamics(ckc_pin.load(name))
 
 
 def at_random(dynamics: ReducedDynamics, x: Array) -> MotionInstants:
@@ -74,7 +81,7 @@ def expressions(dynamics: ReducedDynamics) -> ExpressionFunctions:
 
 @pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "slider_crank", "andrews", "two_ur5"])
 def test_derivatives_of_expressions_are_exact(name: str) -> None:
-    dynamics = ReducedDynamics(ckc_pin.load(name))
+    dynamics = dynamics_of(name)
     require_exact(dynamics, expressions(dynamics), 2)
 
 
@@ -89,13 +96,13 @@ def test_derivatives_are_exact_in_random_mechanisms(kind: LoopType, seed: int) -
 
 @pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "andrews"])
 def test_derivatives_of_the_smallest_singular_value_are_exact(name: str) -> None:
-    dynamics = ReducedDynamics(ckc_pin.load(name))
+    dynamics = dynamics_of(name)
     require_exact(dynamics, SmallestSingularValue(dynamics), 3)
 
 
 def test_the_bound_of_the_smallest_singular_value_is_close() -> None:
     """It is below it by at most the factor (number of singular values)^(-1/50)."""
-    dynamics, random = ReducedDynamics(ckc_pin.load("delta")), np.random.default_rng(4)
+    dynamics, random = dynamics_of("delta"), np.random.default_rng(4)
     mechanism = dynamics.mechanism
     q = mechanism.independent_part(mechanism.q_tree) + random.uniform(-0.2, 0.2, (50, 3))
     q_tree = dynamics.close(np.tile(mechanism.q_tree, (50, 1)), q)

@@ -135,8 +135,7 @@ def optimality_gap(plan: Plan, inside: Inside) -> tuple[float, float]:
     def effort(numbers: Array) -> float:
         total = 0.0
         for q_tree, rate, acceleration, weight in zip(*at(t, numbers), weights, strict=True):
-            v_tree = MODEL.rho(q_tree) @ rate
-            u = MODEL.D(q_tree) @ acceleration + MODEL.C(q_tree, v_tree) @ rate + MODEL.h(q_tree)
+            u = MODEL.force(q_tree, rate, acceleration)
             total += weight * float(u @ u)
         return total
 
