@@ -60,7 +60,8 @@ SAMPLES_PER_INTERVAL = 5
 MAX_UNWOUND_RESIDUAL = 1e-9  # m, rad: change of phi by whole turns of dependent joints
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
-EFFORT_GUESS_INTERVALS, EFFORT_GUESS_TOLERANCE = 20, 1e-6  # of the coarse mesh of guesses of minimum effort
+EFFORT_GUESS_INTERVALS = 20, 40, 80  # of meshes of initial guesses of minimum effort
+EFFORT_GUESS_TOLERANCE = 1e-6
 EFFORT_GUESS_DURATIONS = (1.0, 0.85, 0.6, 1.4, 2.0)  # of initial guesses of minimum effort, relative to a typical one
 WIDER = 10.0  # limits of torques of these guesses, relative to the plan's
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
@@ -366,20 +367,29 @@ def _first_guesses(
     ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
     typical = _typical_duration(_compute_path_terms(dynamics, path), limits, np.median)
     for duration in dict.fromkeys(_duration(minimize, limits, factor * typical) for factor in EFFORT_GUESS_DURATIONS):
-        wide = replace(limits, torque=limits.torque * WIDER, time=duration)
-        smooth = SmoothMotion(path.q, start.rates, end.rates, duration)
-        mesh = np.linspace(0.0, 1.0, EFFORT_GUESS_INTERVALS + 1)
-        guess = sample_motion(dynamics, wide, smooth, mesh, start.at.q_tree, None)
-        problem = Collocation(dynamics, wide, MinimizeSpec(effort=1.0), guess, start.at.q_tree, fixed_duration=True)
-        problem.set_ends(ends)
-        solution, _ = problem.solve(
-            guess, Ipopt(problem, iterations=EFFORT_GUESS_ITERATIONS, tolerance=EFFORT_GUESS_TOLERANCE, warm=False)
-        )
+        solution = _minimize_effort(dynamics, path, replace(limits, torque=limits.torque * WIDER, time=duration), ends,
+                                    start.at.q_tree)  # fmt: skip
         wide_motion = solution.motion()
         torque = interpolation(wide_motion.corners, solution.values.torque)
         yield (wide_motion, torque) if solution.is_optimum else None
     if not is_first:
         yield motion, None
+
+
+def _minimize_effort(
+    dynamics: ReducedDynamics, path: CoordinatePath, limits: MotionLimits, ends: Ends, start: Array
+) -> Solution:
+    """Return a motion of minimum effort with the duration `limits.time`, on a mesh that is fine enough for the path."""
+    smooth = SmoothMotion(path.q, ends.rates[0], ends.rates[1], limits.time)
+    for intervals in EFFORT_GUESS_INTERVALS:
+        guess = sample_motion(dynamics, limits, smooth, np.linspace(0.0, 1.0, intervals + 1), start, None)
+        problem = Collocation(dynamics, limits, MinimizeSpec(effort=1.0), guess, start, fixed_duration=True)
+        problem.set_ends(ends)
+        optimizer = Ipopt(problem, iterations=EFFORT_GUESS_ITERATIONS, tolerance=EFFORT_GUESS_TOLERANCE, warm=False)
+        solution, _ = problem.solve(guess, optimizer)
+        if solution.status != "Invalid_Number_Detected":  # The loops close along the polynomials of this mesh.
+            break
+    return solution
 
 
 def guess_motion(
