@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
 from ckc_pin.base.tables import to_csv_text, to_data_frame
@@ -26,13 +26,24 @@ if TYPE_CHECKING:
     from ckc_pin.run.run import Run
     from ckc_pin.view.inline import Figures
 
-__all__ = ["ActiveLimit", "CoordinateMotion", "Plan", "Replay", "find_active", "measure", "replay_plan"]
+__all__ = [
+    "JUMP_GAP",
+    "ActiveLimit",
+    "CoordinateMotion",
+    "Cycle",
+    "Plan",
+    "Replay",
+    "find_active",
+    "measure",
+    "replay_plan",
+]
 
 ACTIVE_FRACTION = 0.01  # of a limit's range: a quantity that comes closer makes the limit active
 MERGED_GAP = 0.005  # of the duration: a limit that is left for less counts as active all the time
+PERIODS = 3  # of scenes of periodic motions
 REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
 BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
-MAX_SAMPLES = 1_000_000
+JUMP_GAP = 1e-7  # of the duration, between the rows at both sides of a jump of torques
 
 
 class CoordinateMotion(Protocol):
@@ -46,6 +57,22 @@ class CoordinateMotion(Protocol):
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Cycle(Immutable):
+    """A motion that repeats. Its scenes have several periods.
+
+    Attributes
+    ----------
+    turns : (d,) array
+        By how much the independent coordinates grow in a period, rad.
+    periods : int
+        Of the scenes.
+    """
+
+    turns: Array
+    periods: int = PERIODS
+
+
 @dataclass(frozen=True)
 class Replay:
     """Simulation of a plan's torques in the step loop.
@@ -53,7 +80,8 @@ class Replay:
     Attributes
     ----------
     error : float
-        Largest difference of the independent coordinates and their rates at the end, SI units.
+        Largest difference of the independent coordinates and their rates at the end, SI units; of a motion that
+        repeats, after several periods.
     max_tau : float
         Largest motor torque, N m or N.
     closure : float
@@ -103,6 +131,10 @@ class Plan(HasSummary):
     active : tuple of ActiveLimit
     replay : Replay
     warnings : tuple of str
+    via_t : tuple of float
+        When the motion reaches the places of ``[[via]]``, s.
+    cycle : Cycle, optional
+        Of a motion that repeats. The other attributes are of one period.
     """
 
     mechanism: Mechanism
@@ -122,6 +154,8 @@ class Plan(HasSummary):
     active: tuple[ActiveLimit, ...]
     replay: Replay
     warnings: tuple[str, ...]
+    via_t: tuple[float, ...] = ()
+    cycle: Cycle | None = None
 
     def columns(self) -> dict[str, Array]:
         """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
@@ -136,17 +170,22 @@ class Plan(HasSummary):
         control : "open" or "closed"
             The plan's torques over time, or tracking control (eq. 16) of the plan's motion.
         """
-        return _make_scene(self.mechanism, self.motion, self._controller(control), control)
+        return _make_scene(self.mechanism, self.motion, self._controller(control), control, self.cycle)
 
     def _controller(self, control: str) -> dict[str, Any]:
         if control == "open":
-            return _torque_controller(self.mechanism, self.torque_t, self.torque)
+            return _torque_controller(self.mechanism, self.torque_t, self.torque, self.cycle)
         mechanism = self.mechanism
         at = mechanism.assembled
         inertia = np.diag(Terms(mechanism, at, np.zeros(mechanism.n)).D)
         bandwidth = BANDWIDTH / self.t_end
         t = np.linspace(0.0, self.t_end, len(self.t))
         q, _, _ = self.motion(t)
+        if self.cycle is not None:
+            k = np.repeat(np.arange(self.cycle.periods), len(t) - 1)
+            q = np.concatenate([np.tile(q[:-1], (self.cycle.periods, 1)) + k[:, None] * self.cycle.turns,
+                                q[:1] + self.cycle.periods * self.cycle.turns])  # fmt: skip
+            t = np.linspace(0.0, self.cycle.periods * self.t_end, len(q))
         table = {"t": t, **dict(zip(mechanism.independent, q.T, strict=True))}
         return {"type": "tracking", "Lambda": bandwidth, "desired": {"file": table},
                 "K_D": dict(zip(mechanism.independent, (bandwidth * inertia).tolist(), strict=True))}  # fmt: skip
@@ -185,15 +224,17 @@ class Plan(HasSummary):
         largest = [f"{name} {np.abs(self.torque[:, k]).max():.4g} {units[f'tau.{name}'].unit}"
                    for k, name in enumerate(self.mechanism.motors.names)]  # fmt: skip
         reached = [f"{x.quantity} {x.side}, {x.begin:.3g} to {x.end:.3g} s" for x in self.active]
+        periods = "" if self.cycle is None else f"{self.cycle.periods} periods, "
         rows: list[Row] = [
             ("status", f"{self.status}: {self.message}"),
             ("duration", f"{self.t_end:.6g} s"),
+            *([("places reached", [f"{t:.6g} s" for t in self.via_t])] if self.via_t else []),
             ("cost", f"{self.cost:.6g}: " + ", ".join(f"{name} {x:.4g}" for name, x in self.parts.items())),
             ("iterations", str(self.iterations)),
             ("largest torques", largest),
             ("sigma_min", f"at least {self.margin.min():.3g} of the start's"),
             ("active limits", reached or "none"),
-            ("replay", f"error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
+            ("replay", f"{periods}error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
              f"closure of the plan {self.replay.closure:.1e}"),
         ]  # fmt: skip
         rows += [("warning", warning) for warning in self.warnings]
@@ -217,15 +258,19 @@ class Plan(HasSummary):
             "iterations": self.iterations,
             "replay": {"error": self.replay.error, "max_tau": self.replay.max_tau, "closure": self.replay.closure},
             "margin": float(self.margin.min()),
+            "via_t": list(self.via_t),
+            "periods": 1 if self.cycle is None else self.cycle.periods,
             "active": [{"quantity": x.quantity, "side": x.side, "from": x.begin, "to": x.end} for x in self.active],
             "warnings": list(self.warnings),
             "files": [path.name for path in files or []],
         }
 
 
-def _make_scene(mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str) -> Scene:
+def _make_scene(
+    mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str, cycle: Cycle | None
+) -> Scene:
     """Return the scene of a plan: from its start, with a controller."""
-    names, t_end = mechanism.independent, float(motion.corners[-1])
+    names, t_end = mechanism.independent, float(motion.corners[-1]) * (1 if cycle is None else cycle.periods)
     q, rates, _ = motion(np.zeros(1))
     start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
              "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
@@ -235,13 +280,25 @@ def _make_scene(mechanism: Mechanism, motion: CoordinateMotion, controller: dict
     )  # fmt: skip
 
 
-def _torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[str, Any]:
-    """Return the controller of recorded torques."""
+def _torque_controller(mechanism: Mechanism, t: Array, torque: Array, cycle: Cycle | None) -> dict[str, Any]:
+    """Return the controller of recorded torques. Rows with the same time, where torques jump, become different ones."""
+    if cycle is not None:
+        t = np.concatenate([t + k * t[-1] for k in range(cycle.periods)])
+        torque = np.tile(torque, (cycle.periods, 1))
+    same, t, torque = np.flatnonzero(np.diff(t) == 0), np.array(t), np.array(torque)
+    for rows, neighbours in ((same, same - 1), (same + 1, same + 2)):
+        # The rows move along the lines to their neighbours, which keeps the impulse.
+        share = JUMP_GAP * t[-1] / 2 / np.abs(t[neighbours] - t[rows])
+        torque[rows] += share[:, None] * (torque[neighbours] - torque[rows])
+        t[rows] += share * (t[neighbours] - t[rows])
     columns = {"t": t, **dict(zip(mechanism.motors.names, torque.T, strict=True))}
     return {"type": "torques", "file": columns, "interpolation": "linear"}
 
 
-def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, torque: Array, q_tree: Array) -> Replay:
+def replay_plan(
+    dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, torque: Array, q_tree: Array,
+    cycle: Cycle | None = None,
+) -> Replay:  # fmt: skip
     """Simulate a plan's torques and compare the end with the plan's.
 
     Parameters
@@ -251,10 +308,14 @@ def replay_plan(dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, t
     t, torque : (k,) and (k, motors) arrays
     q_tree : (m, nq) array
         Closed configurations of the plan.
+    cycle : Cycle, optional
+        Of a motion that repeats.
     """
     mechanism, at = dynamics.mechanism, dynamics.mechanism.partition.q
-    run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque), "open"))
+    run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque, cycle), "open", cycle))
     q, rates, _ = motion(motion.corners[-1:])
+    if cycle is not None:
+        q = q + (cycle.periods - 1) * cycle.turns
     error = max(np.abs(run.q_tree[-1, at] - q[0]).max(), np.abs(run.v_tree[-1, at] - rates[0]).max())
     closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
     return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.base.sources import Sources
-from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.control.point_path import make_desired
 from ckc_pin.dynamics.equilibrium import stable_equilibrium
 from ckc_pin.errors import InputError, NumericalError
@@ -19,20 +19,21 @@ from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, path_dynamics
-from ckc_pin.optimization.collocation import TOLERANCE, Collocation
+from ckc_pin.optimization.collocation import MIN_DURATION, TOLERANCE, Collocation
 from ckc_pin.optimization.dry_friction import FrictionKnots
 from ckc_pin.optimization.free_path import search_path
+from ckc_pin.optimization.guess_motions import Joined, Slowed, SmoothMotion, scale_durations
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
-from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
+from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Solution, times
 from ckc_pin.optimization.path import PathMotion
-from ckc_pin.optimization.plan import CoordinateMotion, Plan, find_active, measure, replay_plan
+from ckc_pin.optimization.plan import JUMP_GAP, CoordinateMotion, Cycle, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
+from ckc_pin.optimization.route import Route
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec, StateSpec
 
 __all__ = [
     "EndState",
-    "gauss_places",
     "guess_motion",
     "interpolation",
     "plan_between",
@@ -54,6 +55,10 @@ GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
+UNBOUNDED_FACTOR = (
+    1.1  # durations below this multiple of the smallest one that the optimizer may choose have no lower bound
+)
+SIDE = 1e-9  # of the duration, from the end of a phase to where its torque is taken from a guess
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
 
 
@@ -67,10 +72,19 @@ class EndState(Immutable):
 
 
 def plan_between(
-    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, sources: Sources,
-    progress: Callable[[float], None],
+    dynamics: ReducedDynamics, spec: OptimizeSpec, limits: MotionLimits, sources: Sources, names: Sequence[str],
+    states: Sequence[EndState], route: Route, progress: Callable[[float], None],
 ) -> Plan:  # fmt: skip
-    """Plan a motion from one configuration to another.
+    """Plan a motion from one configuration to another through places.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Keys of the places.
+    states : sequence of EndState
+        Configurations of the places.
+    route : Route
+        What is given of the places.
 
     Raises
     ------
@@ -79,36 +93,36 @@ def plan_between(
     NumericalError
         No motion fulfils the limits, or the optimizer does not find one.
     """
-    assert spec.to is not None
-    refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
-    start = resolve_state(mechanism, spec.start, mechanism.assembled, "from")
-    end = resolve_state(mechanism, spec.to, start.at, "to")
-    for state, name in ((start, "from"), (end, "to")):
+    mechanism, start = dynamics.mechanism, states[0]
+    for state, name in zip(states, names, strict=True):
         require_inside(mechanism, limits, state, name)
-    dynamics = ReducedDynamics(mechanism)
-    require_regular(dynamics, limits, start, end)
+    for state, name in zip(states[1:], names[1:], strict=True):
+        require_regular(dynamics, limits, start, state, name)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
-    ends = Ends(np.array([start.q, end.q]), np.array([start.rates, end.rates]))
-    motion = guess_motion(dynamics, spec.minimize, limits, start, end)
-    mesh = base = np.linspace(0.0, 1.0, (spec.intervals or FIRST_INTERVALS) + 1)
+    limits = replace(limits, time=route.time)
+    motion = guess_route(dynamics, spec.minimize, limits, states, route.places.t)
+    ends = motion.corners
+    mesh = base = Mesh.uniform(spec.intervals or FIRST_INTERVALS, np.diff(ends))
     torque: Callable[[Array], Array] | None = None
     iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
     for attempt in range(MAX_MESHES):
-        guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque)
-        friction.begin_mesh(guess.q_tree, motion(guess.duration * gauss_places(mesh))[1])
-        problem = Collocation(dynamics, limits, spec.minimize, guess, start.at.q_tree,
-                              fixed_duration=desired is not None)  # fmt: skip
-        problem.set_ends(ends, None if desired is None else desired(limits.time * gauss_places(mesh)))
+        guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque, ends)
+        gauss_times = times(mesh.gauss_places(), ends)
+        friction.begin_mesh(guess.q_tree, motion(gauss_times)[1])
+        problem = Collocation(dynamics, limits, spec.minimize, guess, start.at.q_tree, route.places,
+                              None if desired is None else desired(gauss_times))  # fmt: skip
         optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
-        duration = _duration(spec.minimize, limits, RETRY_SLOWER * guess.duration)
-        if attempt == 0 and not solution.is_optimum and duration > guess.duration:
+        duration = _duration(spec.minimize, limits, RETRY_SLOWER * float(ends[-1]))
+        if attempt == 0 and not solution.is_optimum and duration > ends[-1] and not route.has_times:
             motion = Slowed(motion, duration)  # The optimizer often succeeds from a slower motion.
+            ends = ends * (duration / ends[-1])
             continue
         require_solved(solution)
+        _require_durations(solution, guess, names)
         friction.end_mesh()
-        plan, exceeded = _assemble(dynamics, limits, solution, iterations, start)
+        plan, exceeded = _assemble(dynamics, limits, spec.minimize, solution, iterations, start, route)
         progress((attempt + 1) / MAX_MESHES)
         misses = plan.replay.error > REPLAY_ERROR
         halves = misses and not friction.is_present and doublings < MAX_DOUBLINGS
@@ -117,20 +131,16 @@ def plan_between(
             return plan
         doublings += halves
         if exceeded.intervals.any() or halves:
-            base = _divide(mesh, exceeded.intervals | halves)
-        mesh = friction.insert(base, plan)
-        motion, torque = plan.motion, interpolation(plan.torque_t, plan.torque)
+            base = mesh.divide(exceeded.intervals | halves)
+        mesh = friction.insert(base, exceeded.samples, exceeded.rates)
+        motion, ends = solution.motion(), solution.values.ends
+        torque = interpolation(solution.values.torque_t, solution.values.torque)
     if not exceeded.intervals.any():
         return plan
     raise NumericalError(
         f"optimize: budget: after {MAX_MESHES} meshes, {exceeded.name} still exceeds its limit by {exceeded.size:.1%} "
         "between the points of the mesh; give more intervals, or a wider limit"
     )
-
-
-def gauss_places(mesh: Array) -> Array:
-    """Return the Gauss points of a mesh from 0 to 1."""
-    return np.asarray((mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel())
 
 
 def read_desired_motion(
@@ -143,14 +153,6 @@ def read_desired_motion(
         raise InputError(str(error).replace("controller.desired", "desired")) from None
     end = float(getattr(desired, "end", np.inf))
     return lambda t: np.array([desired(x)[0] for x in np.minimum(t, end).tolist()])
-
-
-def _divide(mesh: Array, intervals: BoolArray) -> Array:
-    """Return a mesh with intervals and their neighbours halved."""
-    halved = intervals.copy()
-    halved[1:] |= intervals[:-1]
-    halved[:-1] |= intervals[1:]
-    return np.sort(np.concatenate([mesh, ((mesh[1:] + mesh[:-1]) / 2)[halved]]))
 
 
 def interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
@@ -245,12 +247,14 @@ def require_inside(mechanism: Mechanism, limits: MotionLimits, state: EndState, 
         )
 
 
-def require_regular(dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState) -> None:
-    """Require that the end is within the limit of singularity (InputError)."""
+def require_regular(
+    dynamics: ReducedDynamics, limits: MotionLimits, start: EndState, end: EndState, name: str = "to"
+) -> None:
+    """Require that an end is within the limit of singularity (InputError)."""
     margin = dynamics.margins(np.array([start.at.q_tree, end.at.q_tree]))[1]
     if margin < limits.singularity:
         raise InputError(
-            f"optimize: to: sigma_min(phi_z) is {margin:.3g} of its value at the start, below limits.singularity = "
+            f"optimize: {name}: sigma_min(phi_z) is {margin:.3g} of its value at the start, below limits.singularity = "
             f"{limits.singularity:g}; change one of them"
         )
 
@@ -280,82 +284,60 @@ def guess_motion(
     return Slowed(SmoothMotion(path.q, start.rates, end.rates, duration), duration)
 
 
+def guess_route(
+    dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, states: Sequence[EndState], t: Array
+) -> CoordinateMotion:
+    """Return a motion through places, whose corners are its ends and the times of the places.
+
+    Parameters
+    ----------
+    t : (places,) array
+        Times of the places. NaN: free.
+    """
+    if len(states) == 2:
+        return guess_motion(dynamics, minimize, limits, *states)
+    legs = [guess_motion(dynamics, MinimizeSpec(time=1.0), limits, *pair) for pair in pairwise(states)]
+    durations, t = np.array([leg.corners[-1] for leg in legs]), np.array(t)
+    if np.isnan(t[-1]) and (not minimize.time or scale_durations(durations, t).sum() > limits.time):
+        t[-1] = limits.time
+    durations = scale_durations(durations, t)
+    return Joined([Slowed(leg, duration) for leg, duration in zip(legs, durations.tolist(), strict=True)])
+
+
 def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> float:
     if not minimize.time:
         return limits.time
     return min(fastest, limits.time)
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothMotion:
-    """Motion along a path with a cubic polynomial of time, plus cubics that give the rates at the ends."""
-
-    path: PiecewisePolynomial
-    start: Array
-    end: Array
-    duration: float
-
-    @property
-    def corners(self) -> Array:
-        """Both ends, s."""
-        return np.array([0.0, self.duration])
-
-    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
-        T = self.duration
-        x = t / T
-        s, s_dot, s_ddot = 3 * x**2 - 2 * x**3, (6 * x - 6 * x**2) / T, (6 - 12 * x) / T**2
-        q, q_s, q_ss = self.path(s)
-        first = np.array([x - 2 * x**2 + x**3, (1 - 4 * x + 3 * x**2) / T, (-4 + 6 * x) / T**2])
-        last = np.array([x**3 - x**2, (3 * x**2 - 2 * x) / T, (6 * x - 2) / T**2])
-        more = [T * (np.outer(a, self.start) + np.outer(b, self.end)) for a, b in zip(first, last, strict=True)]
-        return (q + more[0], q_s * s_dot[:, None] + more[1],
-                q_s * s_ddot[:, None] + q_ss * s_dot[:, None] ** 2 + more[2])  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Slowed:
-    """A motion with another duration."""
-
-    motion: CoordinateMotion
-    duration: float
-
-    @property
-    def corners(self) -> Array:
-        """Both ends, s."""
-        return np.array([0.0, self.duration])
-
-    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
-        factor = float(self.motion.corners[-1]) / self.duration
-        q, v, a = self.motion(np.minimum(t * factor, self.motion.corners[-1]))
-        return q, v * factor, a * factor**2
-
-
 def sample_motion(
-    dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Array, start: Array,
-    torque: Callable[[Array], Array] | None,
+    dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Mesh, start: Array,
+    torque: Callable[[Array], Array] | None, ends: Array | None = None,
 ) -> Guess:  # fmt: skip
     """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics.
 
-    The loops are followed from the closed configuration `start` (nq,).
+    The loops are followed from the closed configuration `start` (nq,). `ends` are those of the phases, s.
     """
-    duration = float(motion.corners[-1])
-    t = duration * np.sort(np.concatenate([mesh, gauss_places(mesh)]))
+    ends = motion.corners[[0, -1]] if ends is None else ends
+    t = np.sort(times(np.concatenate([mesh.knots, mesh.gauss_places()]), ends))
     is_knot = np.isin(np.arange(len(t)), np.arange(0, len(t), DEGREE + 1))
     q, v, a = motion(t)
     q_tree = dynamics.follow(start, q)
     if q_tree is None:
         raise NumericalError("optimize: stuck: the loops do not close along the initial guess")
-    knots = q_tree[is_knot]
+    # Where a phase ends, torques are those just before and just after it.
+    before_or_after = np.where(np.diff(mesh.knot, append=-1) == 0, -1, np.diff(mesh.knot, prepend=-1) == 0)
+    torque_t = t[is_knot][mesh.knot] + SIDE * ends[-1] * before_or_after
     if torque is None:
-        at = dynamics.instants(knots, v[is_knot], a[is_knot], np.zeros((len(mesh), dynamics.motors)))
+        knots = q_tree[is_knot][mesh.knot]
+        _, rates, accelerations = motion(torque_t)
+        at = dynamics.instants(knots, rates, accelerations, np.zeros((len(knots), dynamics.motors)))
         transmission = np.einsum("mnd,kn->mdk", dynamics.rho(knots), dynamics.mechanism.motors.transmission)
         tau = np.clip(minimum_norm_within(transmission, at.force, limits.torque), *limits.torque)
     else:
-        tau = torque(t[is_knot])
-    accelerations = a[~is_knot].reshape(len(mesh) - 1, DEGREE, -1)
-    return Guess(mesh, duration, q[is_knot], v[is_knot], accelerations, tau, q_tree[~is_knot])
+        tau = torque(torque_t)
+    accelerations = a[~is_knot].reshape(len(mesh.knots) - 1, DEGREE, -1)
+    return Guess(mesh, np.diff(ends), q[is_knot], v[is_knot], accelerations, tau, q_tree[~is_knot])
 
 
 # --- result --------------------------------------------------------------------------------------
@@ -382,49 +364,87 @@ def require_solved(solution: Solution) -> None:
     )
 
 
+def _require_durations(solution: Solution, guess: Guess, names: Sequence[str]) -> None:
+    """Raise NumericalError if a phase has no shortest duration."""
+    short = solution.values.durations < UNBOUNDED_FACTOR * MIN_DURATION * guess.durations
+    if short.any():
+        k = int(np.argmax(short))
+        raise NumericalError(
+            f"optimize: unbounded: the motion from {names[k]} to {names[k + 1]} becomes arbitrarily short; give "
+            "limits.rate, a weight of effort or another place"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Exceeded(Immutable):
-    """Intervals in which limits are exceeded by more than `EXCESS`, and the worst quantity with its relative excess."""
+    """Intervals in which limits are exceeded by more than `EXCESS`, and the worst quantity with its relative excess.
+
+    `samples` (m,) are places in units of the mesh, with v' `rates` (m, n).
+    """
 
     intervals: BoolArray
     name: str
     size: float
+    samples: Array
+    rates: Array
 
 
 def _assemble(
-    dynamics: ReducedDynamics, limits: MotionLimits, solution: Solution, iterations: int, start: EndState
-) -> tuple[Plan, Exceeded]:
+    dynamics: ReducedDynamics, limits: MotionLimits, minimize: MinimizeSpec, solution: Solution, iterations: int,
+    start: EndState, route: Route,
+) -> tuple[Plan, Exceeded]:  # fmt: skip
     mechanism, values = dynamics.mechanism, solution.values
-    motion = solution.motion()
-    torque = np.clip(values.torque, *limits.torque)
-    knots = motion.corners
+    moving, ends = solution.motion(), values.ends
+    knots, torque = values.mesh.knots, np.clip(values.torque, *limits.torque)
     parts = np.arange(SAMPLES_PER_INTERVAL) / SAMPLES_PER_INTERVAL
-    t = np.append((knots[:-1, None] + np.diff(knots)[:, None] * parts).ravel(), knots[-1])
-    q, v, a = motion(t)
+    samples = np.append((knots[:-1, None] + values.mesh.steps[:, None] * parts).ravel(), knots[-1])
+    # Quantities jump where a phase ends. They are sampled just before it, too.
+    t = np.sort(np.concatenate([times(samples, ends), ends[1:-1] - JUMP_GAP * ends[-1]]))
+    is_sample = ~np.isin(t, ends[1:-1] - JUMP_GAP * ends[-1])
+    q, v, a = moving(t)
     q_tree = dynamics.follow(start.at.q_tree, q)
     if q_tree is None:
         raise NumericalError(
             "optimize: stuck: the loops do not close between the points of the mesh; give more intervals"
         )
-    at = dynamics.instants(q_tree, v, a, interpolation(knots, torque)(t))
+    tau = interpolation(values.torque_t, torque)(t)
+    phase = route.phase_of(t, ends)
+    t = t + route.offsets[phase]
+    for k in np.flatnonzero(route.rests)[::-1].tolist():
+        row, gap = int(np.searchsorted(phase, k, side="right")), JUMP_GAP * ends[-1]
+        is_end = row == len(phase)
+        begin = ends[k + 1] + route.offsets[k]
+        rest = [begin + gap * is_end, begin + route.rests[k] - gap * (not is_end)]
+        t, is_sample = np.insert(t, row, rest), np.insert(is_sample, row, [False, False])
+        still = q_tree[row - is_end], np.zeros(dynamics.d), np.zeros(dynamics.d), route.rest_torque[k]
+        q_tree, v, a, tau = (
+            np.insert(x, [row, row], rest_row, axis=0) for x, rest_row in zip((q_tree, v, a, tau), still, strict=True)
+        )
+    at = dynamics.instants(q_tree, v, a, tau)
     quantities, margin = measure(dynamics, limits, at)
-    replay = replay_plan(dynamics, motion, knots, torque, q_tree)
+    motion = route.motion(solution)
+    torque_t, torque = route.torques(values, torque)
+    cycle = None if route.places.turns is None else Cycle(route.places.turns)
+    replay = replay_plan(dynamics, motion, torque_t, torque, q_tree, cycle)
     warnings = []
     if replay.error > REPLAY_ERROR:
         remedy = "give more intervals"
         if mechanism.joints.friction.any():
             remedy = "joints with dry friction may stick, which the plan does not foresee; track the motion"
         warnings.append(f"the replay misses the end by {replay.error:.1e}; {remedy}")
+    at_rest = {"time": float(route.rests.sum()), "effort": float(route.rests @ (route.rest_torque**2).sum(axis=1))}
+    solved = {name: x + at_rest.get(name, 0.0) for name, x in solution.parts.items()}
     plan = Plan(
-        mechanism=mechanism, status="solved", message="a local optimum", t_end=values.duration, cost=solution.cost,
-        parts=solution.parts, iterations=iterations, motion=motion, torque_t=knots, torque=torque, t=t,
-        quantities=quantities, margin=margin, limits=limits,
+        mechanism=mechanism, status="solved", message="a local optimum", t_end=float(motion.corners[-1]),
+        cost=sum(getattr(minimize, name) * x for name, x in solved.items()), parts=solved, iterations=iterations,
+        motion=motion, torque_t=torque_t, torque=torque, t=t, quantities=quantities, margin=margin, limits=limits,
         active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
+        via_t=tuple((ends[1:-1] + route.offsets[1:] - route.rests[:-1]).tolist()), cycle=cycle,
     )  # fmt: skip
-    return plan, _find_excess(limits, quantities, margin)
+    return plan, _find_excess(limits, quantities[is_sample], margin[is_sample], samples, at.v_tree[is_sample])
 
 
-def _find_excess(limits: MotionLimits, quantities: Array, margin: Array) -> Exceeded:
+def _find_excess(limits: MotionLimits, quantities: Array, margin: Array, samples: Array, rates: Array) -> Exceeded:
     """Find the intervals in which limits are exceeded, from samples of them and of the end."""
     size = np.maximum(np.abs(quantities).max(axis=0), 1e-12)
     if limits.spheres:
@@ -436,4 +456,5 @@ def _find_excess(limits: MotionLimits, quantities: Array, margin: Array) -> Exce
     inside: BoolArray = np.asarray(at[:-1].reshape(-1, SAMPLES_PER_INTERVAL * at.shape[1]).any(axis=1))
     inside[-1] |= at[-1].any()
     worst = np.unravel_index(int(np.argmax(relative)), relative.shape)
-    return Exceeded(inside, (*limits.names, "sigma_min")[int(worst[1])], float(relative[worst]))
+    name = (*limits.names, "sigma_min")[int(worst[1])]
+    return Exceeded(inside, name, float(relative[worst]), samples, rates)
