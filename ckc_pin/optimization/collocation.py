@@ -22,6 +22,7 @@ from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.optimization.ipopt import Ipopt, Optimum, merge_patterns, nonzeros
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Places, Solution, gauss_points
+from ckc_pin.optimization.phase_dynamics import PhaseDynamics
 from ckc_pin.optimization.reduced import Derivatives, MotionInstants, ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec
 from ckc_pin.optimization.state_limits import StateLimits
@@ -48,11 +49,13 @@ class Collocation:
     places : Places
     desired : (m, d) array, optional
         The motion at the Gauss points that is to be tracked.
+    members : sequence of ReducedDynamics, optional
+        Dynamics of each phase, if they differ in the bodies' inertias.
     """
 
     def __init__(
         self, dynamics: ReducedDynamics, limits: MotionLimits, minimize: MinimizeSpec, guess: Guess, start: Array,
-        places: Places, desired: Array | None = None,
+        places: Places, desired: Array | None = None, members: Sequence[ReducedDynamics] = (),
     ) -> None:  # fmt: skip
         self.dynamics, self.limits, self.minimize, self.guess = dynamics, limits, minimize, guess
         d, motors = dynamics.d, dynamics.motors
@@ -61,6 +64,7 @@ class Collocation:
         self.step, self.phases, self.phase, self.begin = mesh.steps, mesh.phases, mesh.phase, mesh.begin
         self.knot, self.phase_of_knots = mesh.knot, mesh.phase_of_knots
         self.intervals = len(self.step)
+        self._phase_dynamics = PhaseDynamics(members or [dynamics] * self.phases, np.repeat(self.phase, DEGREE))
         self.last = np.searchsorted(self.phase, np.arange(self.phases), side="right") - 1  # interval of each phase
         self.points, self.weights, self.once, self.twice, self.to_end = gauss_points()
         torque = np.where(np.isfinite(limits.torque), np.abs(limits.torque), 0.0).max(axis=0, initial=0.0)
@@ -266,6 +270,9 @@ class Collocation:
         for k in range(1, self.phases):
             after = w[self.v_at[ends[k - 1] + 1].tolist()]
             require(["motion"], T[k] * v[k] - T[k - 1] * after, 0.0, 0.0)
+            if not self.places.jumps:
+                tau = w[self.tau_at[ends[k - 1] + 1].tolist()] - w[self.tau_at[ends[k - 1]].tolist()]
+                require(["torque at places"], tau, 0.0, 0.0)
         rates = [x - T[max(k - 1, 0)] * p[k * d : (k + 1) * d] for k, x in enumerate(v)]
         require(["rates at places"], cs.vertcat(*rates), 0.0, 0.0)
         self._rate_rows = slice(len(self.labels) - len(rates) * d, len(self.labels))
@@ -276,7 +283,7 @@ class Collocation:
             q, tau = ([w[at[k].tolist()] for k in (0, -1)] for at in (self.q_at, self.tau_at))
             require(["period"], q[1] - q[0], self.places.turns, self.places.turns)
             require(["period"], v[-1] - v[0] if self.phases == 1 else T[0] * v[-1] - T[-1] * v[0], 0.0, 0.0)
-            if self.places.is_smooth:
+            if not self.places.jumps_at_start:
                 require(["period"], tau[1] - tau[0], 0.0, 0.0)
 
     def _limit_motion(self, require: Callable[..., None], w: Any) -> None:
@@ -367,7 +374,7 @@ class Collocation:
             if q_tree is None:
                 return None
             tau = x[:, 3 * d : 3 * d + self.motors]
-            return self.dynamics.instants(q_tree, x[:, d : 2 * d] / T, x[:, 2 * d : 3 * d] / T**2, tau)
+            return self._phase_dynamics.instants(q_tree, x[:, d : 2 * d] / T, x[:, 2 * d : 3 * d] / T**2, tau)
 
         return self._cached("instants", w, compute)
 
@@ -379,7 +386,7 @@ class Collocation:
             if at is None:
                 return None
             self.q_tree = at.q_tree
-            by_x = self.dynamics.differentiate(at)
+            by_x = self._phase_dynamics.differentiate(at)
             force = by_x.force / self.force_unit
             if not self.state_limits.labels:
                 none = np.zeros((len(force), 0, 0))
@@ -441,10 +448,10 @@ class Collocation:
         force_weights, limit_weights = weights[:, :d] / self.force_unit, weights[:, d:]
         if self.state_limits.labels:
             state_weights = np.einsum("mi,mis->ms", limit_weights, gradients)
-            plain = self.dynamics.hessian(at, by_x, force_weights, state_weights)
+            plain = self._phase_dynamics.hessian(at, by_x, force_weights, state_weights)
             self.state_limits.add_hessian(plain, at, by_state, limit_weights)
         else:
-            plain = self.dynamics.hessian(at, by_x, force_weights)
+            plain = self._phase_dynamics.hessian(at, by_x, force_weights)
         gradient = np.einsum("mi,mij->mj", weights, rows)
         size = plain.shape[1]
         # By the chain rule for rates / T and accelerations / T^2.

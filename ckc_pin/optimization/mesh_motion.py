@@ -29,15 +29,16 @@ class Places(Immutable):
         Times, s. NaN: free.
     turns : (d,) array, optional
         The motion is periodic: it ends with the rates with which it begins, and with q that differ by this.
-    is_smooth : bool
-        Torques do not jump where a period ends.
+    jumps, jumps_at_start : bool
+        Whether torques may jump at the places between start and end, and where a period ends.
     """
 
     q: Array
     rates: Array
     t: Array
     turns: Array | None = None
-    is_smooth: bool = False
+    jumps: bool = True
+    jumps_at_start: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -206,7 +206,7 @@ def _between_places(
     refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
     dynamics = ReducedDynamics(mechanism)
     resolved = resolve_places(dynamics, spec, limits.time)
-    route = Route.of(dynamics, limits, resolved.places, resolved.stays, [x.at.q_tree for x in resolved.states])
+    route = Route.of(resolved.members, limits, resolved.places, resolved.stays, [x.at.q_tree for x in resolved.states])
     plan = plan_between(dynamics, spec, limits, sources, resolved.names, resolved.states, route, progress)
     return replace(plan, via_t=(0.0, *plan.via_t)) if resolved.names[0] == "via[0]" else plan
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.validation import suggest_name
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, MechanismError
+from ckc_pin.kinematics.assembly import reassemble
+from ckc_pin.kinematics.loading import check_overrides
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.mesh_motion import Places
 from ckc_pin.optimization.point_to_point import EndState, resolve_state
@@ -19,6 +22,7 @@ from ckc_pin.optimization.spec import OptimizeSpec, PeriodicSpec, StateSpec, Via
 
 __all__ = ["ResolvedPlaces", "resolve_places"]
 
+INERTIAL = ("mass", "com", "inertia")  # parameters of links that may change
 TURN_PLACES = 200  # of a straight line in q along which the loops are followed for the end of a period
 
 
@@ -36,12 +40,15 @@ class ResolvedPlaces:
         Times are those of arrival.
     stays : (phases,) sequence of Stay
         Times at rest after each phase.
+    members : (phases,) sequence of ReducedDynamics
+        Dynamics of each phase.
     """
 
     names: Sequence[str]
     states: Sequence[EndState]
     places: Places
     stays: Sequence[Stay]
+    members: Sequence[ReducedDynamics]
 
 
 def resolve_places(dynamics: ReducedDynamics, spec: OptimizeSpec, longest: float) -> ResolvedPlaces:
@@ -72,9 +79,12 @@ def resolve_places(dynamics: ReducedDynamics, spec: OptimizeSpec, longest: float
         np.array([start.q, *(_given_q(mechanism, spec.via[k], states[k + 1].q) for k in numbers), last.q]),
         np.array([start.rates, *(_given_rates(mechanism, via) for via in spec.via), last.rates]),
         np.array([0.0, *map(_time, spec.via), longest if spec.minimize.tracking else np.nan]),
-    )
+        jumps=not _limits_jumps(spec),
+    )  # fmt: skip
     names = ["from", *(f"via[{k}]" for k in numbers), "to"]
-    return ResolvedPlaces(names, states, places, [*_stays(spec.via, 0), Stay("to", 0.0)])
+    members = _members(dynamics, zip(names, [None, *spec.via], strict=False))
+    stays = [*_stays(spec.via, 0), Stay("to", 0.0)]
+    return ResolvedPlaces(names, states, places, stays, members)
 
 
 def _require_vias(mechanism: Mechanism, spec: OptimizeSpec) -> None:
@@ -94,6 +104,23 @@ def _require_vias(mechanism: Mechanism, spec: OptimizeSpec) -> None:
         for name in ("tracking", "peak_torque"):
             if via.dwell and getattr(spec.minimize, name):
                 raise InputError(f"{where}: dwell: not supported with minimize.{name}; remove one of them")
+        if (name := _limits_jumps(spec)) and (via.dwell or via.parameters):
+            key = "dwell" if via.dwell else "parameters"
+            raise InputError(f"{where}: {key}: torques jump there, which {name} excludes; remove one of them")
+        if via.parameters and not (via.rest or via.dwell):
+            raise InputError(f"{where}: parameters change at rest only; give rest = true, or dwell")
+        if via.parameters and mechanism.joints.friction.any():
+            raise InputError(f"{where}: parameters: not supported with dry friction; remove one of them")
+        for name in via.parameters:
+            if not (name.startswith("link.") and name.split(".")[2:3] and name.split(".")[2] in INERTIAL):
+                raise InputError(f"{where}: parameters: {name} is not the mass, com or inertia of a link; remove it")
+
+
+def _limits_jumps(spec: OptimizeSpec) -> str:
+    """Return the key because of which torques do not jump at places; empty if they may."""
+    keys = {"limits.torque_rate": spec.limits.torque_rate, "limits.jerk": spec.limits.jerk,
+            "minimize.jerk": spec.minimize.jerk}  # fmt: skip
+    return next((name for name, value in keys.items() if value), "")
 
 
 def _resolve_vias(mechanism: Mechanism, vias: Sequence[ViaSpec], start: EndState, first: int = 0) -> list[EndState]:
@@ -135,6 +162,23 @@ def _stays(vias: Sequence[ViaSpec], first: int) -> list[Stay]:
     return [Stay(f"via[{first + k}]", via.dwell) for k, via in enumerate(vias)]
 
 
+def _members(dynamics: ReducedDynamics, begins: Iterable[tuple[str, ViaSpec | None]]) -> list[ReducedDynamics]:
+    """Return the dynamics of phases, from names and keys of the places at which they begin."""
+    members, mechanism = [], dynamics.mechanism
+    overrides: dict[str, Any] = {}
+    present = dynamics
+    for name, via in begins:
+        if via is not None and via.parameters:
+            overrides |= check_overrides(via.parameters, f"optimize: {name}.parameters")
+            try:
+                rebuilt, _ = reassemble(mechanism, {**mechanism.overrides, **overrides}, mechanism.assembled)
+            except (InputError, MechanismError) as error:
+                raise InputError(f"optimize: {name}: {error}") from None
+            present = ReducedDynamics(rebuilt)
+        members.append(present)
+    return members
+
+
 # --- periodic motions ----------------------------------------------------------------------------
 
 
@@ -165,16 +209,19 @@ def _resolve_cycle(
         start_q = np.where(np.arange(mechanism.d) == at, start.q, np.nan)
     states = [start, *_resolve_vias(mechanism, vias, start, number)]
     states.append(_end_of_period(dynamics, start, turns))
+    jumps = not _limits_jumps(spec)
     free, has_time = np.full(mechanism.d, np.nan), periodic.time is not None or bool(spec.minimize.tracking)
     places = Places(
         np.array([start_q, *(_given_q(mechanism, via, x.q) for via, x in zip(vias, states[1:], strict=False)), free]),
         np.array([_given_rates(mechanism, first), *(_given_rates(mechanism, via) for via in vias), free]),
-        np.array([0.0, *map(_time, vias), longest if has_time else np.nan]), turns=turns, is_smooth=is_free,
+        np.array([0.0, *map(_time, vias), longest if has_time else np.nan]), turns=turns, jumps=jumps,
+        jumps_at_start=jumps and not is_free,
     )  # fmt: skip
     numbers = range(number, number + len(vias))
     last = Stay(name, first.dwell if isinstance(first, ViaSpec) else 0.0)
-    return ResolvedPlaces([name, *(f"via[{k}]" for k in numbers), "periodic"], states, places,
-                          [*_stays(vias, number), last])  # fmt: skip
+    names = [name, *(f"via[{k}]" for k in numbers), "periodic"]
+    members = _members(dynamics, zip(names, [first if isinstance(first, ViaSpec) else None, *vias], strict=False))
+    return ResolvedPlaces(names, states, places, [*_stays(vias, number), last], members)
 
 
 def _read_turns(mechanism: Mechanism, periodic: PeriodicSpec) -> Array:

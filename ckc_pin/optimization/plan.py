@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -12,7 +12,9 @@ from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
 from ckc_pin.base.tables import to_csv_text, to_data_frame
+from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.dynamics.terms import Terms
+from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
@@ -33,6 +35,7 @@ __all__ = [
     "Cycle",
     "Plan",
     "Replay",
+    "Section",
     "find_active",
     "measure",
     "replay_plan",
@@ -40,6 +43,7 @@ __all__ = [
 
 ACTIVE_FRACTION = 0.01  # of a limit's range: a quantity that comes closer makes the limit active
 MERGED_GAP = 0.005  # of the duration: a limit that is left for less counts as active all the time
+CUT_TOLERANCE = 1e-12  # of the duration, of the times at which a motion is cut
 PERIODS = 3  # of scenes of periodic motions
 REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
 BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
@@ -55,6 +59,15 @@ class CoordinateMotion(Protocol):
 
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A part of a motion with parameters of its own, from one time to another, s."""
+
+    mechanism: Mechanism
+    begin: float
+    end: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +148,8 @@ class Plan(HasSummary):
         When the motion reaches the places of ``[[via]]``, s.
     cycle : Cycle, optional
         Of a motion that repeats. The other attributes are of one period.
+    sections : tuple of Section
+        Parts with different parameters; empty if all are equal.
     """
 
     mechanism: Mechanism
@@ -156,6 +171,36 @@ class Plan(HasSummary):
     warnings: tuple[str, ...]
     via_t: tuple[float, ...] = ()
     cycle: Cycle | None = None
+    sections: tuple[Section, ...] = ()
+
+    def part(self, number: int) -> Plan:
+        """Return the plan of one of the `sections`, which has a scene of its own. Its time begins at 0.
+
+        Cost, replay and warnings are those of the whole plan.
+
+        Parameters
+        ----------
+        number : int
+            From 0 on.
+
+        Raises
+        ------
+        InputError
+            There is no such section.
+        """
+        if not 0 <= number < len(self.sections):
+            raise InputError(f"part: expected a number below {len(self.sections)}, the sections, got {number}")
+        section = self.sections[number]
+        motion, t, torque = _cut(self.motion, self.torque_t, self.torque, section)
+        rows = (self.t >= section.begin) & (self.t <= section.end)
+        active = [replace(x, begin=max(x.begin, section.begin) - section.begin,
+                          end=min(x.end, section.end) - section.begin)
+                  for x in self.active if x.begin < section.end and x.end > section.begin]  # fmt: skip
+        return replace(
+            self, mechanism=section.mechanism, t_end=section.end - section.begin, motion=motion, torque_t=t,
+            torque=torque, t=self.t[rows] - section.begin, quantities=self.quantities[rows], margin=self.margin[rows],
+            active=tuple(active), via_t=(), cycle=None, sections=(),
+        )  # fmt: skip
 
     def columns(self) -> dict[str, Array]:
         """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
@@ -169,7 +214,14 @@ class Plan(HasSummary):
         ----------
         control : "open" or "closed"
             The plan's torques over time, or tracking control (eq. 16) of the plan's motion.
+
+        Raises
+        ------
+        InputError
+            Parameters change in the motion. Each `part` has a scene.
         """
+        if self.sections:
+            raise InputError("scene: parameters change in this plan; take plan.part(k).scene() of each section")
         return _make_scene(self.mechanism, self.motion, self._controller(control), control, self.cycle)
 
     def _controller(self, control: str) -> dict[str, Any]:
@@ -210,10 +262,14 @@ class Plan(HasSummary):
         return ckc_pin.plot(self)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
-        """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError)."""
+        """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError).
+
+        Scenes of `sections` are in folders of their own, part_1 and so on.
+        """
         folder = Path(folder)
-        scenes = [self.scene(name).save(folder, name, overwrite=overwrite or name == "closed")
-                  for name in ("open", "closed")]  # fmt: skip
+        parts = {folder / f"part_{k + 1}": self.part(k) for k in range(len(self.sections))} or {folder: self}
+        scenes = [part.scene(name).save(place, name, overwrite=overwrite or name == "closed")
+                  for place, part in parts.items() for name in ("open", "closed")]  # fmt: skip
         files = [*scenes, self.to_csv(folder / "plan.csv"), folder / "plan.json"]
         write_atomic(files[-1], to_json(self.to_dict(files)) + "\n")
         return files
@@ -262,18 +318,25 @@ class Plan(HasSummary):
             "periods": 1 if self.cycle is None else self.cycle.periods,
             "active": [{"quantity": x.quantity, "side": x.side, "from": x.begin, "to": x.end} for x in self.active],
             "warnings": list(self.warnings),
-            "files": [path.name for path in files or []],
+            "files": _relative_names(files or []),
         }
 
 
+def _relative_names(files: list[Path]) -> list[str]:
+    """Return paths of files relative to the folder that has all of them."""
+    folder = min((path.parent for path in files), key=lambda x: len(x.parts), default=Path())
+    return [path.relative_to(folder).as_posix() for path in files]
+
+
 def _make_scene(
-    mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str, cycle: Cycle | None
-) -> Scene:
-    """Return the scene of a plan: from its start, with a controller."""
+    mechanism: Mechanism, motion: CoordinateMotion, controller: dict[str, Any], what: str, cycle: Cycle | None,
+    state: tuple[Array, Array] | None = None,
+) -> Scene:  # fmt: skip
+    """Return the scene of a plan: from its start, or another state q and rates, with a controller."""
     names, t_end = mechanism.independent, float(motion.corners[-1]) * (1 if cycle is None else cycle.periods)
-    q, rates, _ = motion(np.zeros(1))
-    start = {"q": dict(zip(names, q[0].tolist(), strict=True)),
-             "q_dot": dict(zip(names, rates[0].tolist(), strict=True))}  # fmt: skip
+    q, rates = (x[0] for x in motion(np.zeros(1))[:2]) if state is None else state
+    start = {"q": dict(zip(names, q.tolist(), strict=True)),
+             "q_dot": dict(zip(names, rates.tolist(), strict=True))}  # fmt: skip
     return Scene(
         mechanism, t_end=t_end, initial=start, controller=controller, name=f"{mechanism.name}, plan, {what} loop",
         solver={"rtol": REPLAY_TOLERANCE, "atol": REPLAY_TOLERANCE, "output_dt": t_end / 200},
@@ -297,7 +360,7 @@ def _torque_controller(mechanism: Mechanism, t: Array, torque: Array, cycle: Cyc
 
 def replay_plan(
     dynamics: ReducedDynamics, motion: CoordinateMotion, t: Array, torque: Array, q_tree: Array,
-    cycle: Cycle | None = None,
+    cycle: Cycle | None = None, sections: tuple[Section, ...] = (),
 ) -> Replay:  # fmt: skip
     """Simulate a plan's torques and compare the end with the plan's.
 
@@ -310,15 +373,44 @@ def replay_plan(
         Closed configurations of the plan.
     cycle : Cycle, optional
         Of a motion that repeats.
+    sections : tuple of Section
+        Parts of the motion with different parameters. Each begins at the end of the one before.
     """
     mechanism, at = dynamics.mechanism, dynamics.mechanism.partition.q
-    run = simulate(_make_scene(mechanism, motion, _torque_controller(mechanism, t, torque, cycle), "open", cycle))
+    parts = [(mechanism, motion, t, torque, cycle)]
+    if sections:
+        parts = [(x.mechanism, *_cut(motion, t, torque, x), None) for x in sections]
+        parts *= 1 if cycle is None else cycle.periods
+    state, max_tau = None, 0.0
+    for model, part, part_t, part_torque, part_cycle in parts:
+        controller = _torque_controller(model, part_t, part_torque, part_cycle)
+        run = simulate(_make_scene(model, part, controller, "open", part_cycle, state))
+        state = run.q_tree[-1, at], run.v_tree[-1, at]
+        max_tau = max(max_tau, float(np.abs(run.tau).max(initial=0.0)))
     q, rates, _ = motion(motion.corners[-1:])
     if cycle is not None:
         q = q + (cycle.periods - 1) * cycle.turns
     error = max(np.abs(run.q_tree[-1, at] - q[0]).max(), np.abs(run.v_tree[-1, at] - rates[0]).max())
     closure = float(np.abs(dynamics.residual(q_tree)).max(initial=0.0))
-    return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
+    return Replay(float(error), max_tau, closure)
+
+
+def _cut(motion: CoordinateMotion, t: Array, torque: Array, section: Section) -> tuple[CoordinateMotion, Array, Array]:
+    """Return a motion and rows of torques from the beginning of a section to its end, over the time since then.
+
+    Of two rows at the beginning, the second one belongs to the section, and of two at the end the first one.
+    """
+    begin, end, tolerance = section.begin, section.end, CUT_TOLERANCE * float(t[-1])
+    first, last = np.flatnonzero(t <= begin + tolerance)[-1], np.flatnonzero(t >= end - tolerance)[0]
+    t, torque = t[first : last + 1] - begin, torque[first : last + 1]
+    assert isinstance(motion, PiecewisePolynomial)
+    middles = (motion.breaks[1:] + motion.breaks[:-1]) / 2
+    pieces = np.flatnonzero((middles > begin) & (middles < end))
+    breaks = motion.breaks[pieces[0] : pieces[-1] + 2] - begin
+    t[[0, -1]] = breaks[[0, -1]] = 0.0, end - begin
+    part = PiecewisePolynomial(breaks, motion.coefficients[:, pieces], corners=breaks,
+                               max_frequency=motion.max_frequency, end=end - begin)  # fmt: skip
+    return part, t, torque
 
 
 def measure(dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants) -> tuple[Array, Array]:

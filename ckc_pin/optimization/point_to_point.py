@@ -27,6 +27,7 @@ from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Solution, times
 from ckc_pin.optimization.path import PathMotion
+from ckc_pin.optimization.phase_dynamics import PhaseDynamics
 from ckc_pin.optimization.plan import JUMP_GAP, CoordinateMotion, Cycle, Plan, find_active, measure, replay_plan
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.route import Route
@@ -100,17 +101,17 @@ def plan_between(
         require_regular(dynamics, limits, start, state, name)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     limits = replace(limits, time=route.time)
-    motion = guess_route(dynamics, spec.minimize, limits, states, route.places.t)
+    motion = guess_route(route.members, spec.minimize, limits, states, route.places.t)
     ends = motion.corners
     mesh = base = Mesh.uniform(spec.intervals or FIRST_INTERVALS, np.diff(ends))
     torque: Callable[[Array], Array] | None = None
     iterations, doublings, friction = 0, 0, FrictionKnots(dynamics)
     for attempt in range(MAX_MESHES):
-        guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque, ends)
+        guess = sample_motion(dynamics, limits, motion, mesh, start.at.q_tree, torque, ends, route.members)
         gauss_times = times(mesh.gauss_places(), ends)
         friction.begin_mesh(guess.q_tree, motion(gauss_times)[1])
         problem = Collocation(dynamics, limits, spec.minimize, guess, start.at.q_tree, route.places,
-                              None if desired is None else desired(gauss_times))  # fmt: skip
+                              None if desired is None else desired(gauss_times), route.members)  # fmt: skip
         optimizer = Ipopt(problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=torque is not None)
         solution, _ = problem.solve(guess, optimizer)
         iterations += solution.iterations
@@ -285,18 +286,22 @@ def guess_motion(
 
 
 def guess_route(
-    dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, states: Sequence[EndState], t: Array
-) -> CoordinateMotion:
+    members: Sequence[ReducedDynamics], minimize: MinimizeSpec, limits: MotionLimits, states: Sequence[EndState],
+    t: Array,
+) -> CoordinateMotion:  # fmt: skip
     """Return a motion through places, whose corners are its ends and the times of the places.
 
     Parameters
     ----------
+    members : sequence of ReducedDynamics
+        Of the phases.
     t : (places,) array
         Times of the places. NaN: free.
     """
     if len(states) == 2:
-        return guess_motion(dynamics, minimize, limits, *states)
-    legs = [guess_motion(dynamics, MinimizeSpec(time=1.0), limits, *pair) for pair in pairwise(states)]
+        return guess_motion(members[0], minimize, limits, *states)
+    legs = [guess_motion(dynamics, MinimizeSpec(time=1.0), limits, *pair)
+            for dynamics, pair in zip(members, pairwise(states), strict=True)]  # fmt: skip
     durations, t = np.array([leg.corners[-1] for leg in legs]), np.array(t)
     if np.isnan(t[-1]) and (not minimize.time or scale_durations(durations, t).sum() > limits.time):
         t[-1] = limits.time
@@ -312,11 +317,12 @@ def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> f
 
 def sample_motion(
     dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Mesh, start: Array,
-    torque: Callable[[Array], Array] | None, ends: Array | None = None,
+    torque: Callable[[Array], Array] | None, ends: Array | None = None, members: Sequence[ReducedDynamics] = (),
 ) -> Guess:  # fmt: skip
     """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics.
 
-    The loops are followed from the closed configuration `start` (nq,). `ends` are those of the phases, s.
+    The loops are followed from the closed configuration `start` (nq,). `ends` are those of the phases, s, and
+    `members` their dynamics.
     """
     ends = motion.corners[[0, -1]] if ends is None else ends
     t = np.sort(times(np.concatenate([mesh.knots, mesh.gauss_places()]), ends))
@@ -331,7 +337,8 @@ def sample_motion(
     if torque is None:
         knots = q_tree[is_knot][mesh.knot]
         _, rates, accelerations = motion(torque_t)
-        at = dynamics.instants(knots, rates, accelerations, np.zeros((len(knots), dynamics.motors)))
+        of_phases = PhaseDynamics(members or [dynamics] * mesh.phases, mesh.phase_of_knots)
+        at = of_phases.instants(knots, rates, accelerations, np.zeros((len(knots), dynamics.motors)))
         transmission = np.einsum("mnd,kn->mdk", dynamics.rho(knots), dynamics.mechanism.motors.transmission)
         tau = np.clip(minimum_norm_within(transmission, at.force, limits.torque), *limits.torque)
     else:
@@ -416,16 +423,18 @@ def _assemble(
         begin = ends[k + 1] + route.offsets[k]
         rest = [begin + gap * is_end, begin + route.rests[k] - gap * (not is_end)]
         t, is_sample = np.insert(t, row, rest), np.insert(is_sample, row, [False, False])
+        phase = np.insert(phase, row, [k, k])
         still = q_tree[row - is_end], np.zeros(dynamics.d), np.zeros(dynamics.d), route.rest_torque[k]
         q_tree, v, a, tau = (
             np.insert(x, [row, row], rest_row, axis=0) for x, rest_row in zip((q_tree, v, a, tau), still, strict=True)
         )
-    at = dynamics.instants(q_tree, v, a, tau)
+    at = PhaseDynamics(route.members, phase).instants(q_tree, v, a, tau)
     quantities, margin = measure(dynamics, limits, at)
     motion = route.motion(solution)
     torque_t, torque = route.torques(values, torque)
     cycle = None if route.places.turns is None else Cycle(route.places.turns)
-    replay = replay_plan(dynamics, motion, torque_t, torque, q_tree, cycle)
+    sections = route.sections(ends)
+    replay = replay_plan(dynamics, motion, torque_t, torque, q_tree, cycle, sections)
     warnings = []
     if replay.error > REPLAY_ERROR:
         remedy = "give more intervals"
@@ -439,7 +448,7 @@ def _assemble(
         cost=sum(getattr(minimize, name) * x for name, x in solved.items()), parts=solved, iterations=iterations,
         motion=motion, torque_t=torque_t, torque=torque, t=t, quantities=quantities, margin=margin, limits=limits,
         active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=tuple(warnings),
-        via_t=tuple((ends[1:-1] + route.offsets[1:] - route.rests[:-1]).tolist()), cycle=cycle,
+        via_t=tuple((ends[1:-1] + route.offsets[1:] - route.rests[:-1]).tolist()), cycle=cycle, sections=sections,
     )  # fmt: skip
     return plan, _find_excess(limits, quantities[is_sample], margin[is_sample], samples, at.v_tree[is_sample])
 

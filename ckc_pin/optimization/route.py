@@ -13,6 +13,7 @@ from ckc_pin.errors import InputError
 from ckc_pin.optimization.along_path import minimum_norm_within
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import Guess, Places, Solution
+from ckc_pin.optimization.plan import Section
 from ckc_pin.optimization.reduced import ReducedDynamics
 
 __all__ = ["Route", "Stay"]
@@ -42,16 +43,19 @@ class Route(Immutable):
         Motor torques meanwhile.
     time : float
         Longest duration without the times at rest, s.
+    members : tuple of ReducedDynamics
+        Of each phase.
     """
 
     places: Places
     rests: Array
     rest_torque: Array
     time: float
+    members: tuple[ReducedDynamics, ...]
 
     @classmethod
     def of(
-        cls, dynamics: ReducedDynamics, limits: MotionLimits, places: Places, stays: Sequence[Stay],
+        cls, members: Sequence[ReducedDynamics], limits: MotionLimits, places: Places, stays: Sequence[Stay],
         q_tree: Sequence[Array],
     ) -> Route:  # fmt: skip
         """Return the route through places with times of arrival and closed configurations (InputError)."""
@@ -64,8 +68,21 @@ class Route(Immutable):
             raise InputError("optimize: via: the times of places do not increase, or leave no time for the motion; "
                              "change time, dwell or limits.time")  # fmt: skip
         rest_torque = [_hold(dynamics, limits, place, stay.name) if stay.duration else np.zeros(dynamics.motors)
-                   for stay, place in zip(stays, q_tree[1:], strict=True)]  # fmt: skip
-        return cls(replace(places, t=t), rests, np.array(rest_torque), longest)
+                       for dynamics, stay, place in zip(members, stays, q_tree[1:], strict=True)]  # fmt: skip
+        return cls(replace(places, t=t), rests, np.array(rest_torque), longest, tuple(members))
+
+    def sections(self, ends: Array) -> tuple[Section, ...]:
+        """Return the parts of a motion with different parameters, from the ends of its phases; none if all are equal.
+
+        Each part includes the time at rest at its end.
+        """
+        begin = np.append(ends[:-1] + self.offsets, ends[-1] + self.rests.sum())
+        first = [k for k, x in enumerate(self.members) if k == 0 or x is not self.members[k - 1]]
+        if len(first) == 1:
+            return ()
+        last = [*first[1:], len(self.members)]
+        return tuple(Section(self.members[a].mechanism, float(begin[a]), float(begin[b]))
+                     for a, b in zip(first, last, strict=True))  # fmt: skip
 
     @property
     def has_times(self) -> bool:

@@ -80,6 +80,9 @@ class ViaSpec(FileStruct, frozen=True, kw_only=True):
     time : s
         When the motion reaches the place; free if absent.
         ``time = 0.5``
+    parameters : as the parameter's
+        Values of masses, centres of mass and inertias of links from the place on, which the motion leaves from rest.
+        ``parameters = {"link.plate.mass" = 0.3}``
     """
 
     q: dict[str, float] | None = None
@@ -88,6 +91,7 @@ class ViaSpec(FileStruct, frozen=True, kw_only=True):
     rest: bool = False
     dwell: Weight = 0.0
     time: Limit | None = None
+    parameters: dict[str, float | list[float]] = {}
 
 
 class PeriodicSpec(FileStruct, frozen=True, kw_only=True):
@@ -95,7 +99,7 @@ class PeriodicSpec(FileStruct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    turns
+    turns : 2π rad
         Whole turns of independent coordinates in a period; 0 for the others.
         ``turns = {crank = 1}``
     time : s
@@ -317,6 +321,8 @@ def read_optimize(path: str | Path) -> tuple[OptimizeSpec, Sources]:
     path = Path(path)
     data = read_toml(read_text(path, "plan"), str(path))
     join_dotted_keys(data, "parameters")
+    for table in data["via"] if isinstance(data.get("via"), list) else ():
+        join_dotted_keys(table, "parameters")
     sources = Sources(str(path), path.parent)
     return make_spec(data, sources.name), sources
 

@@ -63,6 +63,19 @@ def test_cycle_with_times_at_rest() -> None:
     require_replay(plan, FORCE)
 
 
+def test_cycle_with_a_load_on_the_way_there() -> None:
+    """Each way is bang-bang with its own mass. The parts of three periods are run one after the other."""
+    distance, load, rest = 0.7, 1.5, 0.1
+    via = [{"q": {"rail": 0.0}, "dwell": rest, "parameters": {"link.cart.mass": MASS + load}},
+           {"q": {"rail": distance}, "dwell": rest, "parameters": {"link.cart.mass": MASS}}]  # fmt: skip
+    plan = optimize(slider(), via=via, periodic={}, limits={"torque": FORCE}, intervals=100)
+    ways = [2 * np.sqrt(distance * mass / FORCE) for mass in (MASS + load, MASS)]
+    assert plan.t_end == pytest.approx(sum(ways) + 2 * rest, rel=1e-3)
+    assert plan.via_t == pytest.approx((0.0, ways[0]), rel=1e-3)
+    require_period(plan)
+    require_replay(plan, FORCE)
+
+
 def test_least_effort_of_an_oscillator_has_the_fourier_series_of_two_places() -> None:
     """x has odd harmonics only. Their least effort with x(0) = A follows from one multiplier."""
     amplitude, period = 0.3, 1.2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from scipy.interpolate import CubicSpline
 
 import ckc_pin
 from ckc_pin import InputError, Plan, optimize
+from tests.contract.helpers.command import ckc
 from tests.optimization.small_models import GRAVITY, LENGTH, MASS, pendulum, require_replay, slider, table
 
 FORCE, ACCELERATION = 3.0, 3.0 / MASS
@@ -70,6 +72,20 @@ def test_free_times_of_places_are_those_of_least_effort() -> None:
     best = times[int(np.argmin([cost(time) for time in times]))]
     assert plan.cost == pytest.approx(cost(best), rel=1e-7)
     assert plan.via_t[0] == pytest.approx(best, abs=2e-4)
+
+
+def test_torques_do_not_jump_where_their_rate_is_limited() -> None:
+    arguments: dict[str, Any] = {"to": {"q": {"rail": 0.7}}, "via": [{"q": {"rail": 0.3}, "q_dot": {"rail": -0.1}}]}
+    jumping = optimize(slider(), limits={"torque": FORCE}, **arguments)
+    same = np.flatnonzero(np.diff(jumping.torque_t) == 0)
+    assert len(same) == 1
+    rate = 40.0
+    limited = optimize(slider(), limits={"torque": FORCE, "torque_rate": rate}, **arguments)
+    steps, torques = np.diff(limited.torque_t), np.diff(limited.torque[:, 0])
+    assert np.abs(torques[steps == 0]).max() < 1e-8
+    assert np.abs(torques[steps > 0] / steps[steps > 0]).max() < rate * (1 + 1e-6)
+    assert limited.t_end > jumping.t_end
+    require_replay(limited, FORCE)
 
 
 def test_coordinates_that_a_place_does_not_name_are_free() -> None:
@@ -140,9 +156,78 @@ def test_saved_scenes_and_tables_have_jumps_and_times_at_rest(tmp_path: Path) ->
     assert plan.to_dict()["via_t"] == list(plan.via_t)
 
 
+def test_a_mass_is_carried_from_one_place_to_another(tmp_path: Path) -> None:
+    """Each phase is bang-bang with its own acceleration. Files of both sections are run one after the other."""
+    distance, load, rest = 0.7, 2.5, 0.2
+    via = [{"q": {"rail": distance}, "dwell": rest, "parameters": {"link.cart.mass": MASS + load}}]
+    plan = optimize(slider(), to={"q": {"rail": 0.0}}, via=via, limits={"torque": FORCE}, intervals=100)
+    expected = rest + 2 * np.sqrt(distance * MASS / FORCE) + 2 * np.sqrt(distance * (MASS + load) / FORCE)
+    assert plan.t_end == pytest.approx(expected, rel=5e-4)
+    require_replay(plan, FORCE)
+    with pytest.raises(InputError, match=r"take plan\.part\(k\)\.scene\(\) of each section"):
+        plan.scene()
+    with pytest.raises(InputError, match="expected a number below 2"):
+        plan.part(2)
+    files = plan.save(tmp_path)
+    assert plan.to_dict(files)["files"][:2] == ["part_1/open.scene.toml", "part_1/closed.scene.toml"]
+    for number, place in ((1, distance), (2, 0.0)):
+        run = ckc_pin.simulate(tmp_path / f"part_{number}" / "open.scene.toml")
+        assert run["rail"][-1] == pytest.approx(place, abs=1e-6)
+        assert run.t[-1] == pytest.approx(plan.part(number - 1).t_end)
+        closed = ckc_pin.simulate(tmp_path / f"part_{number}" / "closed.scene.toml")
+        assert closed["rail"][-1] == pytest.approx(place, abs=2e-3)
+
+
+def test_parameters_of_a_place_hold_until_the_next_ones() -> None:
+    """The torques at rest are those of the mass before the place."""
+    angle, masses = 0.6, (3.0, 1.0)
+    via = [{"q": {"hinge": angle}, "dwell": 0.1, "parameters": {"link.rod.mass": masses[0]}},
+           {"q": {"hinge": -angle}, "dwell": 0.1},
+           {"q": {"hinge": angle}, "dwell": 0.1, "parameters": {"link.rod.mass": masses[1]}}]  # fmt: skip
+    plan = optimize(pendulum(torque_limit=20.0), via=via, to={"q": {"hinge": 0.0}})
+    at_rest = np.interp(np.array(plan.via_t) + 0.05, plan.torque_t, plan.torque[:, 0])
+    signs, before = np.array([1, -1, 1]), np.array([MASS, masses[0], masses[0]])
+    assert at_rest == pytest.approx(signs * before * GRAVITY * LENGTH * np.sin(angle), rel=1e-9)
+    assert [(x.begin, x.end) for x in plan.sections[1:2]] == [
+        (pytest.approx(plan.via_t[0] + 0.1), pytest.approx(plan.via_t[2] + 0.1))
+    ]
+    require_replay(plan, 20.0)
+
+
+def test_a_file_lists_places_and_parameters(tmp_path: Path) -> None:
+    file = tmp_path / "carry.optimize.toml"
+    file.write_text("""
+        mechanism = "five_bar"
+        to = {q = {theta_1 = -1.434, theta_3 = -1.707}}
+        limits = {torque = 3.0}
+        [[via]]
+        q = {theta_1 = -1.0, theta_3 = -1.9}
+        rest = true
+        [via.parameters]
+        link.link_2.mass = 0.5
+    """)
+    answer = ckc("optimize", str(file))
+    assert answer.code == 0
+    assert "open.scene.toml and closed.scene.toml in part_1 to part_2" in answer.out
+    assert ckc("optimize", str(file), "--out", str(tmp_path / "plan")).code == 0
+    scene = tmp_path / "plan" / "part_2" / "open.scene.toml"
+    assert tomllib.loads(scene.read_text())["parameters"] == {"link.link_2.mass": 0.5}
+    assert ckc("run", str(scene)).code == 0
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"via": [{"q": {"rail": 0.2}, "dwell": 0.1}], "limits": {"torque": 3.0, "torque_rate": 9.0}},
+         "via[0]: dwell: torques jump there, which limits.torque_rate excludes"),
+        ({"via": [{"q": {"rail": 0.2}, "parameters": {"link.cart.mass": 3.0}}]},
+         "via[0]: parameters change at rest only"),
+        ({"via": [{"q": {"rail": 0.2}, "rest": True, "parameters": {"gravity": [0, 0, -1]}}]},
+         "via[0]: parameters: gravity is not the mass, com or inertia of a link"),
+        ({"via": [{"q": {"rail": 0.2}, "rest": True, "parameters": {"link.cat.mass": 3.0}}]},
+         "via[0]: slider: parameters: "),
+        ({"via": [{"q": {"rail": 0.2}, "rest": True, "parameters": {"link.cart.mass": -1.0}}]},
+         "via[0]: slider: parameters: link 'cart': negative mass -1 kg"),
         ({"via": [{}]}, "via[0]: expected either q or point, got neither"),
         ({"via": [{"q": {"rail": 0.2}, "point": {"a": [0, 0, 0]}}]}, "via[0]: expected either q or point, got both"),
         ({"via": [{"q": {"slide": 0.2}}]}, "via[0].q: "),

@@ -146,13 +146,15 @@ def test_derivatives_of_the_nonlinear_program_are_exact(name: str, limits: dict[
         mesh, random.uniform(0.3, 0.6, phases), start + np.outer(mesh.knots, way), np.tile(way / 0.5, (count + 1, 1)),
         random.normal(size=(count, 3, d)), random.normal(size=(count + phases, motors)), q_tree,
     )  # fmt: skip
+    other = {"gravity": [1.0, -2.0, 3.0]}
+    members = [dynamics, ReducedDynamics(ckc_pin.load(name, other))] if phases > 1 else []
     places = Places(
         guess.q[:: count // phases], random.normal(size=(phases + 1, d)), np.full(phases + 1, np.nan),
-        turns=random.normal(size=d) if phases > 1 else None, is_smooth=True,
+        turns=random.normal(size=d) if phases > 1 else None, jumps=False, jumps_at_start=False,
     )  # fmt: skip
     weights = MinimizeSpec(time=1.0, effort=0.1, energy=0.2, jerk=1e-4, peak_torque=0.3, tracking=0.7)
     problem = Collocation(dynamics, make_limits(LimitsSpec(**EVERY_LIMIT | limits), mechanism), weights, guess,
-                          mechanism.q_tree, places, random.normal(size=(3 * count, d)))  # fmt: skip
+                          mechanism.q_tree, places, random.normal(size=(3 * count, d)), members)  # fmt: skip
     w = problem.pack(guess)
     multipliers = random.normal(size=problem.rows)
 
