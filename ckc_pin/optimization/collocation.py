@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.optimization.collocation_cost import cost_parts
 from ckc_pin.optimization.ipopt import Ipopt, Optimum, merge_patterns, nonzeros
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Places, Solution, gauss_points
@@ -169,7 +170,7 @@ class Collocation:
             bounds.append(np.array([np.broadcast_to(low, count), np.broadcast_to(high, count)]))
             self.labels += list(labels) * (count // len(labels))
 
-        parts = self._cost_parts(w, p)
+        parts = cost_parts(self, w, p)
         self._connect(require, w, p)
         self._limit_motion(require, w)
         self._limit_torques(require, w)
@@ -190,43 +191,7 @@ class Collocation:
         self._jacobian = cs.Function("jacobian", [w, p], [nonzeros(jacobian)])
         self._hessian = cs.Function("hessian", [w, p, factor, multipliers], [nonzeros(hessian)])
 
-    def _cost_parts(self, w: Any, p: Any) -> dict[str, Any]:
-        """Return the parts of the cost, in SI units."""
-        import casadi as cs
-
-        minimize = self.minimize
-        shares = np.outer(self.step, self.weights)  # of the duration, of each Gauss point
-        of_interval = w[self.T_at[self.phase].tolist()]
-
-        def integral(values: Any, count: int) -> Any:
-            """Integrate over time from values at the Gauss points, by interval, point, and `count` entries."""
-            weights = cs.DM(np.repeat(shares.ravel(), count))
-            return cs.dot(weights * w[self.T_at[np.repeat(self.phase, DEGREE * count)].tolist()], values)
-
-        parts: dict[str, Any] = {}
-        if minimize.time:
-            parts["time"] = cs.sum1(w[self.T_at.tolist()])
-        if minimize.effort:
-            effort = cs.SX(0)
-            for motor, unit in enumerate(self.unit.tolist()):
-                a, b = (w[self.tau_at[self.begin + side, motor].tolist()] for side in (0, 1))
-                effort += unit**2 * cs.dot(cs.DM(self.step / 3) * of_interval, a**2 + a * b + b**2)
-            parts["effort"] = effort
-        if minimize.energy:
-            power = w[self.slack_at.ravel().tolist()]
-            parts["energy"] = self.power_unit * integral(power, self.slacks)
-        if minimize.tracking:
-            missing = self._at_points(w, 0) - p[self.places.rates.size :]
-            parts["tracking"] = integral(missing**2, self.d)
-        if minimize.jerk:
-            jerk = self._jerks(w, self.points)
-            cubes = w[self.T_at[np.repeat(self.phase, DEGREE * self.d)].tolist()] ** 3
-            parts["jerk"] = integral((jerk / cubes) ** 2, self.d)
-        if minimize.peak_torque:
-            parts["peak_torque"] = w[self.peak_at] * self.force_unit
-        return parts
-
-    def _at_points(self, w: Any, order: int) -> Any:
+    def at_points(self, w: Any, order: int) -> Any:
         """Return q (order 0), rates or accelerations by t / T at the Gauss points, in their order."""
         import casadi as cs
 
@@ -239,7 +204,7 @@ class Collocation:
         matrix = cs.DM.triplet(rows, columns, cs.DM(block[used]), self.intervals * DEGREE * d, self.size)
         return cs.mtimes(matrix, w)
 
-    def _jerks(self, w: Any, places: Array) -> Any:
+    def jerks(self, w: Any, places: Array) -> Any:
         """Return the jerks by t / T at places of each interval, by interval, place, and coordinate."""
         import casadi as cs
 
@@ -289,8 +254,8 @@ class Collocation:
     def _limit_motion(self, require: Callable[..., None], w: Any) -> None:
         """Limit the independent coordinates, their rates, accelerations and jerks."""
         limits, names, d = self.limits, self.dynamics.mechanism.independent, self.d
-        jerks = self._jerks(w, np.array([0.0, 1.0]))  # which are linear in each interval
-        orders = [self._at_points(w, order) for order in range(3)]
+        jerks = self.jerks(w, np.array([0.0, 1.0]))  # which are linear in each interval
+        orders = [self.at_points(w, order) for order in range(3)]
         for i, at in enumerate(self.dynamics.q_at.tolist()):
             low, high = limits.q[:, at].tolist()
             if np.isfinite([low, high]).any():

@@ -11,7 +11,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.optimization.plan import CoordinateMotion
 
-__all__ = ["Joined", "Slowed", "SmoothMotion", "scale_durations"]
+__all__ = ["Joined", "Slowed", "SmoothMotion", "UniformMotion", "scale_durations"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,25 @@ class Slowed:
         factor = float(self.motion.corners[-1]) / self.duration
         q, v, a = self.motion(np.minimum(t * factor, self.motion.corners[-1]))
         return q, v * factor, a * factor**2
+
+
+@dataclass(frozen=True, eq=False)
+class UniformMotion:
+    """Motion along a straight line at constant rates."""
+
+    start: Array
+    end: Array
+    duration: float
+
+    @property
+    def corners(self) -> Array:
+        """Both ends, s."""
+        return np.array([0.0, self.duration])
+
+    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
+        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
+        rates = (self.end - self.start) / self.duration
+        return self.start + np.outer(t, rates), np.tile(rates, (len(t), 1)), np.zeros((len(t), len(rates)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,6 +84,7 @@ def resolve_places(dynamics: ReducedDynamics, spec: OptimizeSpec, longest: float
     names = ["from", *(f"via[{k}]" for k in numbers), "to"]
     members = _members(dynamics, zip(names, [None, *spec.via], strict=False))
     stays = [*_stays(spec.via, 0), Stay("to", 0.0)]
+    _require_ways(names, places.q, places)
     return ResolvedPlaces(names, states, places, stays, members)
 
 
@@ -114,6 +115,17 @@ def _require_vias(mechanism: Mechanism, spec: OptimizeSpec) -> None:
         for name in via.parameters:
             if not (name.startswith("link.") and name.split(".")[2:3] and name.split(".")[2] in INERTIAL):
                 raise InputError(f"{where}: parameters: {name} is not the mass, com or inertia of a link; remove it")
+
+
+def _require_ways(names: Sequence[str], q: Array, places: Places) -> None:
+    """Refuse two equal places one after the other, between which the mechanism could stay at rest for no time."""
+    for k in range(1, len(names) - 1 if len(names) == 2 else len(names)):
+        moves = np.nan_to_num(places.rates[[k - 1, k]]).any() or np.isfinite(places.t[k])
+        if np.array_equal(q[k - 1], q[k]) and not moves:
+            raise InputError(
+                f"optimize: {names[k]}: the same place as {names[k - 1]}; remove one, or give a time or a place "
+                "between them"
+            )
 
 
 def _limits_jumps(spec: OptimizeSpec) -> str:
@@ -221,6 +233,7 @@ def _resolve_cycle(
     last = Stay(name, first.dwell if isinstance(first, ViaSpec) else 0.0)
     names = [name, *(f"via[{k}]" for k in numbers), "periodic"]
     members = _members(dynamics, zip(names, [first if isinstance(first, ViaSpec) else None, *vias], strict=False))
+    _require_ways(names, np.vstack([places.q[:-1], places.q[:1] + turns]), places)
     return ResolvedPlaces(names, states, places, [*_stays(vias, number), last], members)
 
 

@@ -22,7 +22,7 @@ from ckc_pin.optimization.along_path import find_fastest, minimum_norm_within, p
 from ckc_pin.optimization.collocation import MIN_DURATION, TOLERANCE, Collocation
 from ckc_pin.optimization.dry_friction import FrictionKnots
 from ckc_pin.optimization.free_path import search_path
-from ckc_pin.optimization.guess_motions import Joined, Slowed, SmoothMotion, scale_durations
+from ckc_pin.optimization.guess_motions import Joined, Slowed, SmoothMotion, UniformMotion, scale_durations
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Solution, times
@@ -55,6 +55,7 @@ REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
 GUESS_PLACES = 100  # of the path of the initial guess
 SAMPLES_PER_INTERVAL = 5
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
+UNEVEN = 1.3  # duration of a turn of the initial guess, relative to that at the limit of a rate
 RETRY_SLOWER = 2.0  # the duration of a second initial guess, relative to the first one
 UNBOUNDED_FACTOR = (
     1.1  # durations below this multiple of the smallest one that the optimizer may choose have no lower bound
@@ -101,7 +102,8 @@ def plan_between(
         require_regular(dynamics, limits, start, state, name)
     desired = None if spec.desired is None else read_desired_motion(spec.desired, mechanism, sources, limits.time)
     limits = replace(limits, time=route.time)
-    motion = guess_route(route.members, spec.minimize, limits, states, route.places.t)
+    turns = route.places.turns is not None and bool(route.places.turns.any())
+    motion = guess_route(route.members, spec.minimize, limits, states, route.places.t, turns=turns)
     ends = motion.corners
     mesh = base = Mesh.uniform(spec.intervals or FIRST_INTERVALS, np.diff(ends))
     torque: Callable[[Array], Array] | None = None
@@ -287,7 +289,7 @@ def guess_motion(
 
 def guess_route(
     members: Sequence[ReducedDynamics], minimize: MinimizeSpec, limits: MotionLimits, states: Sequence[EndState],
-    t: Array,
+    t: Array, *, turns: bool = False,
 ) -> CoordinateMotion:  # fmt: skip
     """Return a motion through places, whose corners are its ends and the times of the places.
 
@@ -297,9 +299,16 @@ def guess_route(
         Of the phases.
     t : (places,) array
         Times of the places. NaN: free.
+    turns : bool
+        The motion repeats after whole turns, so that it need not rest at its ends.
     """
     if len(states) == 2:
-        return guess_motion(members[0], minimize, limits, *states)
+        motion = guess_motion(members[0], minimize, limits, *states)
+        if not turns:
+            return motion
+        way = states[1].q - states[0].q
+        fastest = float(np.max(np.abs(way) / limits.rate[members[0].q_at])) or float(motion.corners[-1])
+        return UniformMotion(states[0].q, states[1].q, _duration(minimize, limits, UNEVEN * fastest))
     legs = [guess_motion(dynamics, MinimizeSpec(time=1.0), limits, *pair)
             for dynamics, pair in zip(members, pairwise(states), strict=True)]  # fmt: skip
     durations, t = np.array([leg.corners[-1] for leg in legs]), np.array(t)

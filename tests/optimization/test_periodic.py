@@ -157,6 +157,7 @@ def test_scenes_have_several_periods(tmp_path: Path) -> None:
     [
         ({}, "periodic: a mechanism at rest is a solution; give turns, a second place"),
         ({"via": [{"q": {"rail": 0.2}}]}, "periodic: a mechanism at rest is a solution"),
+        ({"via": [{"q": {"rail": 0.2}}, {"q": {"rail": 0.2}}]}, "via[1]: the same place as via[0]"),
         ({"to": {"q": {"rail": 0.2}}}, "to: a periodic motion ends where it begins"),
         ({"path": {"q": {"rail": [0.0, 0.2]}}}, "path: a periodic motion ends where it begins"),
         ({"periodic": {"turns": {"rail": 1}}}, "periodic.turns.rail: rail is a length, which does not turn"),

@@ -218,6 +218,7 @@ def test_a_file_lists_places_and_parameters(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"via": [{"q": {"rail": 0.2}}, {"q": {"rail": 0.2}, "dwell": 0.1}]}, "via[1]: the same place as via[0]"),
         ({"via": [{"q": {"rail": 0.2}, "dwell": 0.1}], "limits": {"torque": 3.0, "torque_rate": 9.0}},
          "via[0]: dwell: torques jump there, which limits.torque_rate excludes"),
         ({"via": [{"q": {"rail": 0.2}, "parameters": {"link.cart.mass": 3.0}}]},
