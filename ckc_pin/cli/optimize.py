@@ -54,4 +54,7 @@ def optimize(file: Path, out: Path | None, as_json: bool) -> None:
         print_json(plan.to_dict(files))
     else:
         print_summary(plan.summary())
-        print(format_destination(out, "open.scene.toml and closed.scene.toml, to run, and plan.csv, for the robot"))
+        scenes = "open.scene.toml and closed.scene.toml"
+        if plan.sections:
+            scenes = f"{scenes} in part_1 to part_{len(plan.sections)}"
+        print(format_destination(out, f"{scenes}, to run, and plan.csv, for the robot"))

@@ -35,6 +35,8 @@ __all__ = [
     "compile_terms",
     "explain_too_large",
     "find_compiled_terms",
+    "is_private",
+    "structure_key",
 ]
 
 COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, measured in docs/theory/generated.md
@@ -183,7 +185,19 @@ def _with_numbers_of_files(mechanism: Mechanism, subject: _Subject) -> Mechanism
 
 
 def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_derivatives: bool, of_members: bool) -> str:
-    """Return the hash of everything that enters the code: this package, the tree, the rows, which numbers are zero."""
+    kind = directional_derivatives, of_members, platform.machine()
+    return hash_of((structure_key(mechanism, which), *kind))[:32]
+
+
+def structure_key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
+    """Return the hash of everything that enters expressions: this package, the tree, the rows, which numbers are zero.
+
+    Parameters
+    ----------
+    mechanism : Mechanism
+    which : mapping
+        Numbers that are arguments (`arguments.present`).
+    """
     tree, closure = mechanism.tree, mechanism.closure
     model = tree.model
     joints = [
@@ -210,8 +224,7 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_deriv
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
     arguments = {name: x.tolist() for name, x in which.items()}
     springs = mechanism.springs.anchors.point_joint.tolist()
-    kind = (mechanism.redundant, directional_derivatives, of_members, platform.machine())
-    return hash_of((_package_hash(), joints, groups, table, arguments, springs, *kind))[:32]
+    return hash_of((_package_hash(), joints, groups, table, arguments, springs, mechanism.redundant))
 
 
 def _is_constant(group: object, name: str) -> bool:
@@ -243,10 +256,15 @@ def _look_up(subject: _Subject, folder: Path) -> Library | None:
     return None
 
 
+def is_private(folder: Path) -> bool:
+    """Return whether only this user can write to a folder."""
+    stat = folder.stat()
+    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022
+
+
 def _is_usable(folder: Path) -> bool:
     """Return whether only this user can write to a folder, and libraries can be loaded from it."""
-    stat = folder.stat()
-    return stat.st_uid == os.getuid() and not stat.st_mode & 0o022 and _allows_execution(folder)
+    return is_private(folder) and _allows_execution(folder)
 
 
 def _allows_execution(folder: Path) -> bool:

@@ -1,12 +1,13 @@
-"""Optimal control from one configuration to another by direct collocation of the reduced equations of motion.
+"""Optimal control from one place to another by direct collocation of the reduced equations of motion.
 
-Unknowns are the duration T, q and its rate at the knots of a mesh, accelerations at the Gauss points of each interval,
-and motor torques at the knots, which are linear between them. q is the polynomial that has these accelerations, so that
-rates and accelerations belong to the same motion everywhere. Eq. 6 holds at the Gauss points. The dependent coordinates
-are sigma(q) everywhere (`ReducedDynamics`), so the loops are closed along the continuous motion.
+Unknowns are the duration T of each phase, q and its rate at the knots of a mesh, accelerations at the Gauss points of
+each interval, and motor torques at the knots, which are linear between them and may jump where a phase ends. q is the
+polynomial that has these accelerations, so that rates and accelerations belong to the same motion everywhere. Eq. 6
+holds at the Gauss points. The dependent coordinates are sigma(q) everywhere (`ReducedDynamics`), so the loops are
+closed along the continuous motion.
 
-Rates and accelerations are by t / T. All equations but eq. 6 and the limits of the state (`StateLimits`) are then
-linear, except for limits of accelerations and jerks.
+Rates and accelerations are by t / T of their phase. All equations but eq. 6 and the limits of the state (`StateLimits`)
+are then linear, except for limits of accelerations and jerks, and for the rates where a phase ends.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.optimization.collocation_cost import cost_parts
 from ckc_pin.optimization.ipopt import Ipopt, Optimum, merge_patterns, nonzeros
 from ckc_pin.optimization.limits import MotionLimits
-from ckc_pin.optimization.mesh_motion import DEGREE, Ends, Guess, Solution, gauss_points
+from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Places, Solution, gauss_points
+from ckc_pin.optimization.phase_dynamics import PhaseDynamics
 from ckc_pin.optimization.reduced import Derivatives, MotionInstants, ReducedDynamics
 from ckc_pin.optimization.spec import MinimizeSpec
 from ckc_pin.optimization.state_limits import StateLimits
 
-__all__ = ["Collocation"]
+__all__ = ["MIN_DURATION", "TOLERANCE", "Collocation"]
 
 MIN_DURATION = 1e-4  # of the initial guess's
 MAX_DURATION = 1e3  # of the initial guess's, if there is no limit
@@ -41,23 +44,29 @@ class Collocation:
     limits : MotionLimits
     minimize : MinimizeSpec
     guess : Guess
-        Its mesh, its duration, and the sizes of its quantities are kept.
+        Its mesh, its durations, and the sizes of its quantities are kept.
     start : (nq,) array
         Configuration to which `limits.singularity` is relative.
-    fixed_duration : bool
-        The duration is `limits.time`.
+    places : Places
+    desired : (m, d) array, optional
+        The motion at the Gauss points that is to be tracked.
+    members : sequence of ReducedDynamics, optional
+        Dynamics of each phase, if they differ in the bodies' inertias.
     """
 
     def __init__(
-        self, dynamics: ReducedDynamics, limits: MotionLimits, minimize: MinimizeSpec, guess: Guess, start: Array, *,
-        fixed_duration: bool = False,
+        self, dynamics: ReducedDynamics, limits: MotionLimits, minimize: MinimizeSpec, guess: Guess, start: Array,
+        places: Places, desired: Array | None = None, members: Sequence[ReducedDynamics] = (),
     ) -> None:  # fmt: skip
         self.dynamics, self.limits, self.minimize, self.guess = dynamics, limits, minimize, guess
-        self.fixed_duration = fixed_duration
         d, motors = dynamics.d, dynamics.motors
         self.d, self.motors = d, motors
-        self.step = np.diff(guess.mesh)
+        mesh = guess.mesh
+        self.step, self.phases, self.phase, self.begin = mesh.steps, mesh.phases, mesh.phase, mesh.begin
+        self.knot, self.phase_of_knots = mesh.knot, mesh.phase_of_knots
         self.intervals = len(self.step)
+        self._phase_dynamics = PhaseDynamics(members or [dynamics] * self.phases, np.repeat(self.phase, DEGREE))
+        self.last = np.searchsorted(self.phase, np.arange(self.phases), side="right") - 1  # interval of each phase
         self.points, self.weights, self.once, self.twice, self.to_end = gauss_points()
         torque = np.where(np.isfinite(limits.torque), np.abs(limits.torque), 0.0).max(axis=0, initial=0.0)
         typical = np.maximum(np.abs(guess.torque).max(axis=0), 1e-3 * max(np.abs(guess.torque).max(initial=0.0), 1e-9))
@@ -69,35 +78,36 @@ class Collocation:
         self.q_tree = guess.q_tree
         self._number_variables()
         self._cache: dict[str, tuple[bytes, Any]] = {}
-        self.set_ends(Ends(guess.q[[0, -1]], guess.rates[[0, -1]]))
+        self.set_places(places, desired)
         self._make_simple_part()
         self._make_patterns()
 
-    def set_ends(self, ends: Ends, desired: Array | None = None) -> None:
-        """Set start and end of the motion, and the motion at the Gauss points (m, d) that it is to track."""
-        self.ends = ends
+    def set_places(self, places: Places, desired: Array | None = None) -> None:
+        """Set the places that the motion passes, and the motion at the Gauss points (m, d) that it is to track."""
+        self.places = places
         m = self.intervals * DEGREE
         desired = np.zeros((m, self.d)) if desired is None else desired
-        self._parameters = np.concatenate([np.nan_to_num(ends.rates).ravel(), desired.ravel()])
+        self._parameters = np.concatenate([np.nan_to_num(places.rates).ravel(), desired.ravel()])
         self._cache.clear()
 
     # --- variables -------------------------------------------------------------------------------
 
     def _number_variables(self) -> None:
-        d, motors, count = self.d, self.motors, self.intervals
-        sizes = [1, 1, (count + 1) * d, (count + 1) * d, count * DEGREE * d, (count + 1) * motors,
+        d, motors, count, knots = self.d, self.motors, self.intervals, len(self.knot)
+        sizes = [1, self.phases, (count + 1) * d, knots * d, count * DEGREE * d, knots * motors,
                  count * DEGREE * self.slacks]  # fmt: skip
         ends = np.cumsum([0, *sizes])
         number = [np.arange(a, b) for a, b in pairwise(ends.tolist())]
         self.size = int(ends[-1])
-        self.peak_at, self.T_at = int(number[0][0]), int(number[1][0])
-        self.q_at, self.v_at = (x.reshape(count + 1, d) for x in number[2:4])
-        self.a_at, self.tau_at = number[4].reshape(count, DEGREE, d), number[5].reshape(count + 1, motors)
+        self.peak_at, self.T_at = int(number[0][0]), number[1]
+        # Rates by t / T and torques have two values where a phase ends and the next one begins.
+        self.q_at, self.v_at = number[2].reshape(count + 1, d), number[3].reshape(knots, d)
+        self.a_at, self.tau_at = number[4].reshape(count, DEGREE, d), number[5].reshape(knots, motors)
         self.slack_at = number[6].reshape(count * DEGREE, self.slacks)
         # Of each interval: its variables, and x = (q, rates, accelerations, tau, T) at the Gauss points by them.
         self.columns = np.concatenate(
-            [self.q_at[:-1], self.v_at[:-1], self.a_at.reshape(count, -1), self.tau_at[:-1], self.tau_at[1:],
-             np.full((count, 1), self.T_at)], axis=1,
+            [self.q_at[:-1], self.v_at[self.begin], self.a_at.reshape(count, -1), self.tau_at[self.begin],
+             self.tau_at[self.begin + 1], self.T_at[self.phase][:, None]], axis=1,
         )  # fmt: skip
         width, unit = self.columns.shape[1], np.arange(d)
         self.by_variables = np.zeros((count, DEGREE, 3 * d + motors + 1, width))
@@ -120,10 +130,11 @@ class Collocation:
 
     def pack(self, guess: Guess) -> Array:
         """Return the variables of a guess."""
-        w, T = np.empty(self.size), guess.duration
+        w, T = np.empty(self.size), guess.durations
         w[self.T_at] = T
-        w[self.q_at], w[self.v_at] = guess.q, T * guess.rates
-        w[self.a_at], w[self.tau_at] = T**2 * guess.accelerations, guess.torque / self.unit
+        w[self.q_at], w[self.v_at] = guess.q, T[self.phase_of_knots, None] * guess.rates[self.knot]
+        w[self.a_at] = T[self.phase, None, None] ** 2 * guess.accelerations
+        w[self.tau_at] = guess.torque / self.unit
         w[self.peak_at] = np.abs(guess.torque).max(initial=0.0) / self.force_unit
         w[self.slack_at] = 0.0
         at = self._instants(w) if self.slacks else None
@@ -133,10 +144,12 @@ class Collocation:
 
     def unpack(self, w: Array) -> Guess:
         """Return variables as a guess."""
-        T = float(w[self.T_at])
+        T = w[self.T_at]
+        rates = w[self.v_at] / T[self.phase_of_knots, None]
+        first = np.append(self.begin, self.begin[-1] + 1)
         return Guess(
-            self.guess.mesh, T, w[self.q_at], w[self.v_at] / T, w[self.a_at] / T**2, w[self.tau_at] * self.unit,
-            self.q_tree,
+            self.guess.mesh, T, w[self.q_at], rates[first], w[self.a_at] / T[self.phase, None, None] ** 2,
+            w[self.tau_at] * self.unit, self.q_tree,
         )  # fmt: skip
 
     # --- cost and simple constraints -------------------------------------------------------------
@@ -157,7 +170,7 @@ class Collocation:
             bounds.append(np.array([np.broadcast_to(low, count), np.broadcast_to(high, count)]))
             self.labels += list(labels) * (count // len(labels))
 
-        parts = self._cost_parts(w, p)
+        parts = cost_parts(self, w, p)
         self._connect(require, w, p)
         self._limit_motion(require, w)
         self._limit_torques(require, w)
@@ -178,36 +191,7 @@ class Collocation:
         self._jacobian = cs.Function("jacobian", [w, p], [nonzeros(jacobian)])
         self._hessian = cs.Function("hessian", [w, p, factor, multipliers], [nonzeros(hessian)])
 
-    def _cost_parts(self, w: Any, p: Any) -> dict[str, Any]:
-        """Return the parts of the cost, in SI units."""
-        import casadi as cs
-
-        T, minimize = w[self.T_at], self.minimize
-        shares = np.outer(self.step, self.weights).ravel()  # of the duration, of each Gauss point
-        parts: dict[str, Any] = {}
-        if minimize.time:
-            parts["time"] = T
-        if minimize.effort:
-            effort = cs.SX(0)
-            for motor, unit in enumerate(self.unit.tolist()):
-                tau = w[self.tau_at[:, motor].tolist()]
-                a, b = tau[:-1], tau[1:]
-                effort += unit**2 * cs.dot(cs.DM(self.step / 3), a**2 + a * b + b**2)
-            parts["effort"] = T * effort
-        if minimize.energy:
-            power = w[self.slack_at.ravel().tolist()]
-            parts["energy"] = T * self.power_unit * cs.dot(cs.DM(np.repeat(shares, self.slacks)), power)
-        if minimize.tracking:
-            missing = self._at_points(w, 0) - p[2 * self.d :]
-            parts["tracking"] = T * cs.dot(cs.DM(np.repeat(shares, self.d)), missing**2)
-        if minimize.jerk:
-            jerk = self._jerks(w, self.points)
-            parts["jerk"] = cs.dot(cs.DM(np.repeat(shares, self.d)), jerk**2) / T**5
-        if minimize.peak_torque:
-            parts["peak_torque"] = w[self.peak_at] * self.force_unit
-        return parts
-
-    def _at_points(self, w: Any, order: int) -> Any:
+    def at_points(self, w: Any, order: int) -> Any:
         """Return q (order 0), rates or accelerations by t / T at the Gauss points, in their order."""
         import casadi as cs
 
@@ -220,7 +204,7 @@ class Collocation:
         matrix = cs.DM.triplet(rows, columns, cs.DM(block[used]), self.intervals * DEGREE * d, self.size)
         return cs.mtimes(matrix, w)
 
-    def _jerks(self, w: Any, places: Array) -> Any:
+    def jerks(self, w: Any, places: Array) -> Any:
         """Return the jerks by t / T at places of each interval, by interval, place, and coordinate."""
         import casadi as cs
 
@@ -234,44 +218,64 @@ class Collocation:
         return cs.vec(by_place)[order.ravel().tolist()]
 
     def _connect(self, require: Callable[..., None], w: Any, p: Any) -> None:
-        """Require that the polynomial of each interval ends at the next knot, and the rates of both ends."""
+        """Require that polynomials of intervals end at the next knot, and the places' rates and times."""
         import casadi as cs
 
-        T, h = w[self.T_at], cs.DM(self.step)
-        for i in range(self.d):
-            q, v = w[self.q_at[:, i].tolist()], w[self.v_at[:, i].tolist()]
+        T, h, d = w[self.T_at.tolist()], cs.DM(self.step), self.d
+        for i in range(d):
+            q = w[self.q_at[:, i].tolist()]
+            v_begin, v_end = (w[self.v_at[self.begin + side, i].tolist()] for side in (0, 1))
             a = [w[self.a_at[:, k, i].tolist()] for k in range(DEGREE)]
             gain = sum(x * y for x, y in zip(self.weights.tolist(), a, strict=True))
             way = sum(x * y for x, y in zip(self.to_end.tolist(), a, strict=True))
-            require(["motion"], v[1:] - v[:-1] - h * gain, 0.0, 0.0)
-            require(["motion"], q[1:] - q[:-1] - h * v[:-1] - h**2 * way, 0.0, 0.0)
-        rates = w[self.v_at[[0, -1]].ravel().tolist()] - T * p[: 2 * self.d]
-        require(["ends"], rates, 0.0, 0.0)
-        self._rate_rows = slice(len(self.labels) - 2 * self.d, len(self.labels))
+            require(["motion"], v_end - v_begin - h * gain, 0.0, 0.0)
+            require(["motion"], q[1:] - q[:-1] - h * v_begin - h**2 * way, 0.0, 0.0)
+        ends = self.begin[self.last] + 1  # of the phases
+        v = [w[self.v_at[k].tolist()] for k in (0, *ends.tolist())]
+        for k in range(1, self.phases):
+            after = w[self.v_at[ends[k - 1] + 1].tolist()]
+            require(["motion"], T[k] * v[k] - T[k - 1] * after, 0.0, 0.0)
+            if not self.places.jumps:
+                tau = w[self.tau_at[ends[k - 1] + 1].tolist()] - w[self.tau_at[ends[k - 1]].tolist()]
+                require(["torque at places"], tau, 0.0, 0.0)
+        rates = [x - T[max(k - 1, 0)] * p[k * d : (k + 1) * d] for k, x in enumerate(v)]
+        require(["rates at places"], cs.vertcat(*rates), 0.0, 0.0)
+        self._rate_rows = slice(len(self.labels) - len(rates) * d, len(self.labels))
+        if self.phases > 1:
+            require(["time"], cs.cumsum(T), 0.0, 0.0)
+            self._time_rows = slice(len(self.labels) - self.phases, len(self.labels))
+        if self.places.turns is not None:
+            q, tau = ([w[at[k].tolist()] for k in (0, -1)] for at in (self.q_at, self.tau_at))
+            require(["period"], q[1] - q[0], self.places.turns, self.places.turns)
+            require(["period"], v[-1] - v[0] if self.phases == 1 else T[0] * v[-1] - T[-1] * v[0], 0.0, 0.0)
+            if not self.places.jumps_at_start:
+                require(["period"], tau[1] - tau[0], 0.0, 0.0)
 
     def _limit_motion(self, require: Callable[..., None], w: Any) -> None:
         """Limit the independent coordinates, their rates, accelerations and jerks."""
-        limits, names, T, d = self.limits, self.dynamics.mechanism.independent, w[self.T_at], self.d
-        jerks = self._jerks(w, np.array([0.0, 1.0]))  # which are linear in each interval
-        orders = [self._at_points(w, order) for order in range(3)]
+        limits, names, d = self.limits, self.dynamics.mechanism.independent, self.d
+        jerks = self.jerks(w, np.array([0.0, 1.0]))  # which are linear in each interval
+        orders = [self.at_points(w, order) for order in range(3)]
         for i, at in enumerate(self.dynamics.q_at.tolist()):
             low, high = limits.q[:, at].tolist()
             if np.isfinite([low, high]).any():
                 require([names[i]], orders[0][i::d], low, high)
             knots = w[self.v_at[:, i].tolist()]
+            of_points, of_ends = np.repeat(self.phase, DEGREE), np.repeat(self.phase, 2)
             for label, limit, values, power in (
-                ("v", limits.rate[at], [orders[1][i::d], knots], 1),
-                ("a", limits.acceleration[at], [orders[2][i::d]], 2),
-                ("jerk", limits.jerk[i], [jerks[i::d]], 3),
+                ("v", limits.rate[at], [(orders[1][i::d], of_points), (knots, self.phase_of_knots)], 1),
+                ("a", limits.acceleration[at], [(orders[2][i::d], of_points)], 2),
+                ("jerk", limits.jerk[i], [(jerks[i::d], of_ends)], 3),
             ):
-                for x in values if np.isfinite(limit) else ():
-                    require([f"{label}.{names[i]}"], x / float(limit) - T**power, -np.inf, 0.0)
-                    require([f"{label}.{names[i]}"], x / float(limit) + T**power, 0.0, np.inf)
+                for x, phase in values if np.isfinite(limit) else ():
+                    unit = w[self.T_at[phase].tolist()] ** power
+                    require([f"{label}.{names[i]}"], x / float(limit) - unit, -np.inf, 0.0)
+                    require([f"{label}.{names[i]}"], x / float(limit) + unit, 0.0, np.inf)
 
     def _limit_torques(self, require: Callable[..., None], w: Any) -> None:
         import casadi as cs
 
-        limits, T, peak = self.limits, w[self.T_at], w[self.peak_at]
+        limits, T, peak = self.limits, w[self.T_at[self.phase].tolist()], w[self.peak_at]
         for motor, name in enumerate(self.dynamics.mechanism.motors.names):
             tau = w[self.tau_at[:, motor].tolist()]
             if self.minimize.peak_torque:
@@ -281,8 +285,9 @@ class Collocation:
             limit = limits.torque_rate[motor]
             if np.isfinite(limit):
                 bound = cs.DM(limit * self.step / self.unit[motor]) * T
-                require([f"torque_rate.{name}"], tau[1:] - tau[:-1] - bound, -np.inf, 0.0)
-                require([f"torque_rate.{name}"], tau[1:] - tau[:-1] + bound, 0.0, np.inf)
+                change = tau[(self.begin + 1).tolist()] - tau[self.begin.tolist()]
+                require([f"torque_rate.{name}"], change - bound, -np.inf, 0.0)
+                require([f"torque_rate.{name}"], change + bound, 0.0, np.inf)
 
     # --- the mechanism at the Gauss points -------------------------------------------------------
 
@@ -320,17 +325,21 @@ class Collocation:
         x = np.einsum("kjxc,kc->kjx", self.by_variables, w[self.columns])
         return x.reshape(self.intervals * DEGREE, -1)
 
+    def _point_durations(self, w: Array) -> Array:
+        """Return the duration of the phase of each Gauss point, (m,)."""
+        return np.asarray(np.repeat(w[self.T_at][self.phase], DEGREE))
+
     def _instants(self, w: Array) -> MotionInstants | None:
         def compute() -> MotionInstants | None:
             x, d = self._points_of(w), self.d
-            T = w[self.T_at]
-            if not T > 0:
+            T = x[:, -1:]
+            if not np.all(T > 0):
                 return None
             q_tree = self.dynamics.close(self.q_tree, x[:, :d])
             if q_tree is None:
                 return None
             tau = x[:, 3 * d : 3 * d + self.motors]
-            return self.dynamics.instants(q_tree, x[:, d : 2 * d] / T, x[:, 2 * d : 3 * d] / T**2, tau)
+            return self._phase_dynamics.instants(q_tree, x[:, d : 2 * d] / T, x[:, 2 * d : 3 * d] / T**2, tau)
 
         return self._cached("instants", w, compute)
 
@@ -342,7 +351,7 @@ class Collocation:
             if at is None:
                 return None
             self.q_tree = at.q_tree
-            by_x = self.dynamics.differentiate(at)
+            by_x = self._phase_dynamics.differentiate(at)
             force = by_x.force / self.force_unit
             if not self.state_limits.labels:
                 none = np.zeros((len(force), 0, 0))
@@ -380,13 +389,13 @@ class Collocation:
         if result is None:
             return np.full(self.jacobian_pattern.nnz(), np.nan)
         at, _, _, _, rows = result
-        T, d = float(w[self.T_at]), self.d
+        T, d = self._point_durations(w), self.d
         scaled = rows.copy()  # by rates and accelerations by t / T
-        scaled[..., d : 2 * d] /= T
-        scaled[..., 2 * d : 3 * d] /= T**2
+        scaled[..., d : 2 * d] /= T[:, None, None]
+        scaled[..., 2 * d : 3 * d] /= T[:, None, None] ** 2
         v, a = at.v_tree[:, self.dynamics.q_at], at.a_tree[:, self.dynamics.q_at]
-        by_T = -np.einsum("mij,mj->mi", rows[..., d : 2 * d], v) / T
-        by_T -= 2 * np.einsum("mij,mj->mi", rows[..., 2 * d : 3 * d], a) / T
+        by_T = -np.einsum("mij,mj->mi", rows[..., d : 2 * d], v) / T[:, None]
+        by_T -= 2 * np.einsum("mij,mj->mi", rows[..., 2 * d : 3 * d], a) / T[:, None]
         full = np.concatenate([scaled, by_T[..., None]], axis=2)
         local = full.reshape(self.intervals, DEGREE, rows.shape[1], -1) @ self.by_variables
         values = np.concatenate([simple, local.ravel(), np.full(self.slack_at.size, -1.0)])
@@ -399,15 +408,15 @@ class Collocation:
         if result is None:
             return np.full(self.hessian_pattern.nnz(), np.nan)
         at, by_x, by_state, gradients, rows = result
-        T, d = float(w[self.T_at]), self.d
+        T, d = self._point_durations(w)[:, None], self.d
         weights = multipliers[self.simple_rows :].reshape(len(rows), -1)
         force_weights, limit_weights = weights[:, :d] / self.force_unit, weights[:, d:]
         if self.state_limits.labels:
             state_weights = np.einsum("mi,mis->ms", limit_weights, gradients)
-            plain = self.dynamics.hessian(at, by_x, force_weights, state_weights)
+            plain = self._phase_dynamics.hessian(at, by_x, force_weights, state_weights)
             self.state_limits.add_hessian(plain, at, by_state, limit_weights)
         else:
-            plain = self.dynamics.hessian(at, by_x, force_weights)
+            plain = self._phase_dynamics.hessian(at, by_x, force_weights)
         gradient = np.einsum("mi,mij->mj", weights, rows)
         size = plain.shape[1]
         # By the chain rule for rates / T and accelerations / T^2.
@@ -423,8 +432,8 @@ class Collocation:
         full[:, -1, rate] -= gradient[:, rate] / T**2
         full[:, acceleration, -1] -= 2 * gradient[:, acceleration] / T**3
         full[:, -1, acceleration] -= 2 * gradient[:, acceleration] / T**3
-        full[:, -1, -1] += 2 * np.einsum("mi,mi->m", gradient[:, rate], v) / T**2
-        full[:, -1, -1] += 6 * np.einsum("mi,mi->m", gradient[:, acceleration], a) / T**2
+        full[:, -1, -1] += 2 * np.einsum("mi,mi->m", gradient[:, rate], v / T**2)
+        full[:, -1, -1] += 6 * np.einsum("mi,mi->m", gradient[:, acceleration], a / T**2)
         by_variables = self.by_variables
         blocks = full.reshape(self.intervals, DEGREE, size + 1, size + 1)
         local = (by_variables.transpose(0, 1, 3, 2) @ blocks @ by_variables).sum(axis=1)
@@ -436,26 +445,31 @@ class Collocation:
     def variable_bounds(self) -> Array:
         """Return lower and upper bounds of the variables, (2, variables)."""
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
-        low[self.T_at] = MIN_DURATION * self.guess.duration
-        high[self.T_at] = min(self.limits.time, MAX_DURATION * self.guess.duration)
-        if self.fixed_duration:
-            low[self.T_at] = high[self.T_at]
+        low[self.T_at] = MIN_DURATION * self.guess.durations
+        high[self.T_at] = np.minimum(self.limits.time, MAX_DURATION * self.guess.durations)
+        if self.phases == 1 and np.isfinite(self.places.t[1]):
+            low[self.T_at] = high[self.T_at] = self.places.t[1]
         low[self.q_at], high[self.q_at] = self.limits.q[:, self.dynamics.q_at]
         low[self.tau_at], high[self.tau_at] = self.limits.torque / self.unit
         low[self.peak_at] = low[self.slack_at] = 0.0
         if not self.minimize.peak_torque:
             high[self.peak_at] = low[self.peak_at]
-        for k, side in ((0, 0), (-1, 1)):
-            fixed = np.isfinite(self.ends.q[side])
+        for k, q in zip((0, *(self.last + 1).tolist()), self.places.q, strict=True):
+            fixed = np.isfinite(q)
             at = self.q_at[k][fixed]
-            low[at] = high[at] = self.ends.q[side][fixed]
+            low[at] = high[at] = q[fixed]
         return np.array([low, high])
 
     def solve(self, guess: Guess, optimizer: Ipopt, last: Optimum | None = None) -> tuple[Solution, Optimum]:
         """Run an optimizer of this program from a guess, with the multipliers of a solution nearby."""
         self.q_tree = guess.q_tree
-        free = ~np.isfinite(self.ends.rates.ravel())
-        self.bounds[0, self._rate_rows], self.bounds[1, self._rate_rows] = np.where(free, [[-np.inf], [np.inf]], 0.0)
+        free = ~np.isfinite(self.places.rates.ravel())
+        self.bounds[:, self._rate_rows] = np.where(free, [[-np.inf], [np.inf]], 0.0)
+        if self.phases > 1:
+            free = ~np.isfinite(self.places.t[1:])
+            self.bounds[:, self._time_rows] = np.where(free, [[-np.inf], [np.inf]], self.places.t[1:])
+            end = self._time_rows.stop - 1
+            self.bounds[1, end] = min(self.bounds[1, end], self.limits.time)
         optimum = optimizer.solve(self.pack(guess), self.variable_bounds(), last)
         w = optimum.w
         cost, values = self.constraints(w)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ckc_pin.base.arrays import Array
-from ckc_pin.optimization.plan import Plan
+from ckc_pin.optimization.mesh_motion import Mesh
 from ckc_pin.optimization.reduced import ReducedDynamics
 
 __all__ = ["FrictionKnots"]
@@ -59,21 +59,28 @@ class FrictionKnots:
         """Return to equations without friction."""
         self._dynamics.directions = None
 
-    def insert(self, mesh: Array, plan: Plan) -> Array:
-        """Return a mesh with knots where the joints of a plan turn back, without other knots close to them."""
-        places = self._turns(plan)
+    def insert(self, mesh: Mesh, samples: Array, rates: Array) -> Mesh:
+        """Return a mesh with knots where joints turn back, without other knots close to them, except ends of phases.
+
+        Parameters
+        ----------
+        mesh : Mesh
+        samples : (m,) array
+            Places in units of the mesh.
+        rates : (m, n) array
+            v' there.
+        """
+        knots, places = mesh.knots, self._turns(samples, rates)
         if len(places) == len(self._places):
             places = self._places + RELAXATION * (places - self._places)
         self._places = places
-        far = np.abs(mesh[1:-1, None] - places).min(axis=1, initial=1.0) > MIN_GAP * np.diff(mesh).min()
-        return np.unique(np.concatenate([mesh[[0, -1]], mesh[1:-1][far], places]))
+        far = np.abs(knots[:, None] - places).min(axis=1, initial=1.0) > MIN_GAP * mesh.steps.min()
+        return Mesh(np.unique(np.concatenate([knots[far | (knots == np.floor(knots))], places])))
 
-    def _turns(self, plan: Plan) -> Array:
-        """Return the places from 0 to 1 at which joints with dry friction turn back."""
-        n = len(self._rubs)
-        rates = plan.quantities[:, n : 2 * n][:, self._rubs]
-        before, after = rates[:-1], rates[1:]
+    def _turns(self, samples: Array, rates: Array) -> Array:
+        """Return the places at which joints with dry friction turn back."""
+        before, after = rates[:-1, self._rubs], rates[1:, self._rubs]
         k, joint = np.nonzero(before * after < 0)
         share = before[k, joint] / (before[k, joint] - after[k, joint])
-        places = np.sort(plan.t[k] + share * np.diff(plan.t)[k]) / plan.t_end
-        return np.asarray(places[(places > END_GAP) & (places < 1 - END_GAP)])
+        places = np.sort(samples[k] + share * np.diff(samples)[k])
+        return np.asarray(places[np.abs(places - np.rint(places)) > END_GAP])

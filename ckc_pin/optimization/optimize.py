@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.base.sources import Sources
-from ckc_pin.base.validation import require_callable, require_table
+from ckc_pin.base.validation import describe_value, require_callable, require_table
 from ckc_pin.dynamics.inverse import friction_force
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.loading import as_mechanism, load_beside
@@ -23,13 +24,28 @@ from ckc_pin.optimization.along_path import (
     minimum_norm_within,
     path_dynamics,
 )
+from ckc_pin.optimization.end_states import (
+    refuse_unsupported,
+    refuse_with_crossings,
+    require_inside,
+    require_regular,
+    resolve_state,
+)
 from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.limits import MotionLimits, make_limits
 from ckc_pin.optimization.path import CoordinatePath, PathMotion, make_path
-from ckc_pin.optimization.plan import Plan, find_active, measure, replay_plan
-from ckc_pin.optimization.point_to_point import plan_between, require_inside, require_regular, resolve_state
+from ckc_pin.optimization.places import resolve_places
+from ckc_pin.optimization.plan import JUMP_GAP, Plan, find_active, measure, replay_plan
+from ckc_pin.optimization.point_to_point import plan_between
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
-from ckc_pin.optimization.spec import OptimizeSpec, PathSpec, make_spec, read_optimize
+from ckc_pin.optimization.route import Route
+from ckc_pin.optimization.spec import (
+    OptimizeSpec,
+    PathSpec,
+    StateSpec,
+    make_spec,
+    read_optimize,
+)
 from ckc_pin.optimization.speed_profile import SpeedProfile
 from ckc_pin.scene.arguments import embed_file
 
@@ -46,7 +62,6 @@ LIMIT_TOLERANCE = 2e-5  # relative: limits are narrowed by it on the grid, and b
 FORCE_TOLERANCE = 1e-8  # relative to the largest force: what torques within limits may fail to produce
 TORQUE_TOLERANCE = 1e-6  # relative to the largest torque: error of linear interpolation between rows
 MAX_ROWS = 32  # of the torques' table in an interval
-CORNER_GAP = 1e-7  # of the duration, between the rows at both sides of a jump of torques
 
 
 def optimize(
@@ -54,6 +69,8 @@ def optimize(
     *,
     start: Mapping[str, Any] | None = None,
     to: Mapping[str, Any] | None = None,
+    via: Sequence[Mapping[str, Any]] | None = None,
+    periodic: Mapping[str, Any] | None = None,
     path: Mapping[str, Any] | None = None,
     minimize: Mapping[str, float] | None = None,
     limits: Mapping[str, Any] | None = None,
@@ -70,6 +87,11 @@ def optimize(
     start, to : mapping, optional
         The keys of ``[from]`` and ``[to]``: ``{"q": {"theta_1": -1.2, "theta_3": -1.9}}``,
         ``{"point": {"tip": [0.1, -0.4, 0.0]}}`` or ``{"at": "equilibrium"}``. The start is as assembled by default.
+    via : sequence of mappings, optional
+        The keys of each ``[[via]]``, places that the motion passes: ``[{"q": {"theta_1": -1.2}, "dwell": 0.1}]``.
+    periodic : mapping, optional
+        The keys of ``[periodic]``, of a motion that repeats: ``{"turns": {"crank": 1}}``. Then there is no `to`, and
+        coordinates and rates that `start` does not name are free.
     path : mapping, optional
         The keys of ``[path]``, of the fastest motion along one:
         ``{"q": {"theta_1": [-1.2, -1.0], "theta_3": [-1.9, -1.7]}}``, or
@@ -96,13 +118,21 @@ def optimize(
     """
     mechanism = as_mechanism(mechanism, "optimize")
     require_callable(progress, "optimize: progress", "a function of the fraction", 1)
-    tables = {"from": start, "to": to, "path": path, "minimize": minimize, "limits": limits, "desired": desired}
-    spec, sources = read_arguments(mechanism, tables, intervals, "optimize", cross_singularities=cross_singularities)
+    tables = {"from": start, "to": to, "periodic": periodic, "path": path, "minimize": minimize, "limits": limits,
+              "desired": desired}  # fmt: skip
+    spec, sources = read_arguments(
+        mechanism, tables, intervals, "optimize", via, cross_singularities=cross_singularities
+    )
     return _optimize(mechanism, spec, sources, progress or (lambda fraction: None))
 
 
 def read_arguments(
-    mechanism: Mechanism, tables: Mapping[str, Any], intervals: int | None, where: str, **keys: Any
+    mechanism: Mechanism,
+    tables: Mapping[str, Any],
+    intervals: int | None,
+    where: str,
+    via: Any = None,
+    **keys: Any,
 ) -> tuple[OptimizeSpec, Sources]:
     """Return the task that the tables and other keys of a file, from Python, describe; tables of None are absent.
 
@@ -116,6 +146,12 @@ def read_arguments(
         if table is not None:
             require_table(table, f"{where}: {name}", f"a table with the keys of [{name}]")
             data[name] = _to_data(table)
+    if via is not None:
+        if isinstance(via, str) or not isinstance(via, Sequence):
+            raise InputError(f"{where}: via: expected a list of tables, got {describe_value(via)}")
+        for k, table in enumerate(via):
+            require_table(table, f"{where}: via[{k}]", "a table with the keys of [[via]]")
+        data["via"] = _to_data(via)
     if intervals is not None:
         data["intervals"] = intervals
     texts: dict[str, str] = {}
@@ -144,14 +180,42 @@ def _optimize(mechanism: Mechanism, spec: OptimizeSpec, sources: Sources, progre
     if not mechanism.d:
         raise InputError(f"optimize: {mechanism.name} has no freedoms, so that nothing moves")
     is_free = spec.path is not None and spec.path.shape == "free"
-    if (spec.path is None or is_free) == (spec.to is None):
+    if spec.periodic is not None and (spec.to is not None or spec.path is not None):
+        other = "to" if spec.to is not None else "path"
+        raise InputError(f"optimize: {other}: a periodic motion ends where it begins; remove {other} or periodic")
+    if spec.periodic is None and (spec.path is None or is_free) == (spec.to is None):
         got = "neither" if spec.to is None else "both"
         raise InputError(f'optimize: expected either `to` or `path`, got {got}; path.shape = "free" needs both')
+    if spec.via and spec.path is not None:
+        raise InputError("optimize: via: a motion along a path passes the places of the path; remove via or path")
     limits = make_limits(spec.limits, mechanism)
     with one_blas_thread():
         if spec.path is None:
-            return plan_between(mechanism, spec, limits, sources, progress)
+            return _between_places(mechanism, spec, limits, sources, progress)
         return _along_path(mechanism, spec, spec.path, limits)
+
+
+def _between_places(
+    mechanism: Mechanism, spec: OptimizeSpec, limits: MotionLimits, sources: Sources,
+    progress: Callable[[float], None],
+) -> Plan:  # fmt: skip
+    """Plan a motion from one configuration to another, or a periodic one."""
+    period = None if spec.periodic is None else spec.periodic.time
+    if period is not None:
+        if period > limits.time:
+            raise InputError(f"optimize: periodic.time: {period:g} s is above limits.time = {limits.time:g} s")
+        limits = replace(limits, time=period)
+        if spec.minimize.time:
+            raise InputError("optimize: periodic.time: the period is given, which minimize.time does not change; give "
+                             "another weight, as effort = 1.0")  # fmt: skip
+    refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
+    if spec.cross_singularities:
+        refuse_with_crossings(spec)
+    dynamics = ReducedDynamics(mechanism)
+    resolved = resolve_places(dynamics, spec, limits.time)
+    route = Route.of(resolved.members, limits, resolved.places, resolved.stays, [x.at.q_tree for x in resolved.states])
+    plan = plan_between(dynamics, spec, limits, sources, resolved.names, resolved.states, route, progress)
+    return replace(plan, via_t=(0.0, *plan.via_t)) if resolved.names[0] == "via[0]" else plan
 
 
 def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits: MotionLimits) -> Plan:
@@ -173,7 +237,7 @@ def _along_path(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limit
         cost=t_end * spec.minimize.time, parts={"time": t_end}, iterations=sweeps,
         coordinates=mechanism.independent, motion=motion, torque_t=t, torque=torque, t=t,
         quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, t, quantities, margin)), crossings=(), replay=replay, warnings=path.warnings,
+        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=path.warnings,
     )  # fmt: skip
 
 
@@ -186,7 +250,7 @@ def _find_free_path(
     if places:
         raise InputError(f'optimize: path.{places[0]} does not belong to shape = "free"; remove it')
     mechanism = dynamics.mechanism
-    start = resolve_state(mechanism, spec.start, mechanism.assembled, "from")
+    start = resolve_state(mechanism, spec.start or StateSpec(at="assembled"), mechanism.assembled, "from")
     end = resolve_state(mechanism, spec.to, start.at, "to")
     for state, name in ((start, "from"), (end, "to")):
         require_inside(mechanism, limits, state, name)
@@ -286,7 +350,7 @@ def _torque_table(
     -h^2 / 12 of the second derivative, with h the distance of rows.
     """
     corners = motion.corners
-    gap = np.minimum(CORNER_GAP * corners[-1], np.diff(corners) / 4)
+    gap = np.minimum(JUMP_GAP * corners[-1], np.diff(corners) / 4)
     begin, end = corners[:-1] + gap / 2, corners[1:] - gap / 2
     begin[0], end[-1] = 0.0, corners[-1]
     three = np.stack([begin, (begin + end) / 2, end], axis=1)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, BoolArray
+from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.base.atomic_files import write_atomic
 from ckc_pin.base.summary import HasSummary, Row, Summary, to_json
 from ckc_pin.base.tables import to_csv_text, to_data_frame
+from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError
 from ckc_pin.kinematics.sigma import sigma
@@ -28,13 +29,28 @@ if TYPE_CHECKING:
     from ckc_pin.run.run import Run
     from ckc_pin.view.inline import Figures
 
-__all__ = ["ActiveLimit", "CoordinateMotion", "Crossing", "Plan", "Replay", "find_active", "measure", "replay_plan"]
+__all__ = [
+    "JUMP_GAP",
+    "ActiveLimit",
+    "CoordinateMotion",
+    "Crossing",
+    "Cycle",
+    "Plan",
+    "Replay",
+    "Section",
+    "find_active",
+    "measure",
+    "replay_plan",
+]
 
 ACTIVE_FRACTION = 0.01  # of a limit's range: a quantity that comes closer makes the limit active
 MERGED_GAP = 0.005  # of the duration: a limit that is left for less counts as active all the time
+CUT_TOLERANCE = 1e-12  # of the duration, of the times at which a motion is cut
+PERIODS = 3  # of scenes of periodic motions
 REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
-BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
 BRANCH_TOLERANCE = 1e-6  # rad, m: of coordinates on the branch of the assembled configuration
+BANDWIDTH = 20.0  # of the tracking controller, in units of 1 / t_end
+JUMP_GAP = 1e-7  # of the duration, between the rows at both sides of a jump of torques
 
 
 class CoordinateMotion(Protocol):
@@ -48,6 +64,31 @@ class CoordinateMotion(Protocol):
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
 
 
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A part of a motion with parameters of its own, from one time to another, s."""
+
+    mechanism: Mechanism
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle(Immutable):
+    """A motion that repeats. Its scenes have several periods.
+
+    Attributes
+    ----------
+    turns : (d,) array
+        By how much the independent coordinates grow in a period, rad.
+    periods : int
+        Of the scenes.
+    """
+
+    turns: Array
+    periods: int = PERIODS
+
+
 @dataclass(frozen=True)
 class Replay:
     """Simulation of a plan's torques in the step loop.
@@ -55,7 +96,8 @@ class Replay:
     Attributes
     ----------
     error : float
-        Largest difference of the motion's coordinates and their rates at the end, SI units.
+        Largest difference of the motion's coordinates and their rates at the end, SI units; of a motion that
+        repeats, after several periods.
     max_tau : float
         Largest motor torque, N m or N.
     closure : float
@@ -122,10 +164,16 @@ class Plan(HasSummary):
         Smallest singular value of phi_z, relative to the start; 1 without loops.
     limits : MotionLimits
     active : tuple of ActiveLimit
-    crossings : tuple of Crossing
-        Passages through singular configurations.
     replay : Replay
     warnings : tuple of str
+    crossings : tuple of Crossing
+        Passages through singular configurations.
+    via_t : tuple of float
+        When the motion reaches the places of ``[[via]]``, s.
+    cycle : Cycle, optional
+        Of a motion that repeats. The other attributes are of one period.
+    sections : tuple of Section
+        Parts with different parameters; empty if all are equal.
     """
 
     mechanism: Mechanism
@@ -144,9 +192,41 @@ class Plan(HasSummary):
     margin: Array
     limits: MotionLimits
     active: tuple[ActiveLimit, ...]
-    crossings: tuple[Crossing, ...]
     replay: Replay
     warnings: tuple[str, ...]
+    crossings: tuple[Crossing, ...] = ()
+    via_t: tuple[float, ...] = ()
+    cycle: Cycle | None = None
+    sections: tuple[Section, ...] = ()
+
+    def part(self, number: int) -> Plan:
+        """Return the plan of one of the `sections`, which has a scene of its own. Its time begins at 0.
+
+        Cost, replay and warnings are those of the whole plan.
+
+        Parameters
+        ----------
+        number : int
+            From 0 on.
+
+        Raises
+        ------
+        InputError
+            There is no such section.
+        """
+        if not 0 <= number < len(self.sections):
+            raise InputError(f"part: expected a number below {len(self.sections)}, the sections, got {number}")
+        section = self.sections[number]
+        motion, t, torque = _cut(self.motion, self.torque_t, self.torque, section)
+        rows = (self.t >= section.begin) & (self.t <= section.end)
+        active = [replace(x, begin=max(x.begin, section.begin) - section.begin,
+                          end=min(x.end, section.end) - section.begin)
+                  for x in self.active if x.begin < section.end and x.end > section.begin]  # fmt: skip
+        return replace(
+            self, mechanism=section.mechanism, t_end=section.end - section.begin, motion=motion, torque_t=t,
+            torque=torque, t=self.t[rows] - section.begin, quantities=self.quantities[rows], margin=self.margin[rows],
+            active=tuple(active), via_t=(), cycle=None, sections=(),
+        )  # fmt: skip
 
     def columns(self) -> dict[str, Array]:
         """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
@@ -164,16 +244,20 @@ class Plan(HasSummary):
         Raises
         ------
         InputError
-            Tracking control of a motion that crosses singular configurations, where eq. 16 has no torques.
+            Parameters change in the motion. Each `part` has a scene. Or tracking control of a motion that crosses
+            singular configurations, where eq. 16 has no torques.
         """
+        if self.sections:
+            raise InputError("scene: parameters change in this plan; take plan.part(k).scene() of each section")
         if control == "closed" and not self.can_be_tracked:
             raise InputError(
                 "plan.scene: tracking control (eq. 16) has no torques in the singular configurations that the plan "
                 'crosses; take control = "open"'
             )
-        n = self.mechanism.n
-        return _make_scene(self.mechanism, self.quantities[0, :n], self.quantities[0, n : 2 * n], self.t_end,
-                           self._controller(control), control, crosses=not self.can_be_tracked)  # fmt: skip
+        n, periods = self.mechanism.n, 1 if self.cycle is None else self.cycle.periods
+        return _make_scene(self.mechanism, self.quantities[0, :n], self.quantities[0, n : 2 * n],
+                           periods * self.t_end, self._controller(control), control,
+                           crosses=not self.can_be_tracked)  # fmt: skip
 
     @property
     def can_be_tracked(self) -> bool:
@@ -182,13 +266,18 @@ class Plan(HasSummary):
 
     def _controller(self, control: str) -> dict[str, Any]:
         if control == "open":
-            return _torque_controller(self.mechanism, self.torque_t, self.torque)
+            return _torque_controller(self.mechanism, self.torque_t, self.torque, self.cycle)
         mechanism = self.mechanism
         at = mechanism.assembled
         inertia = np.diag(Terms(mechanism, at, np.zeros(mechanism.n)).D)
         bandwidth = BANDWIDTH / self.t_end
         t = np.linspace(0.0, self.t_end, len(self.t))
         q, _, _ = self.motion(t)
+        if self.cycle is not None:
+            k = np.repeat(np.arange(self.cycle.periods), len(t) - 1)
+            q = np.concatenate([np.tile(q[:-1], (self.cycle.periods, 1)) + k[:, None] * self.cycle.turns,
+                                q[:1] + self.cycle.periods * self.cycle.turns])  # fmt: skip
+            t = np.linspace(0.0, self.cycle.periods * self.t_end, len(q))
         table = {"t": t, **dict(zip(mechanism.independent, q.T, strict=True))}
         return {"type": "tracking", "Lambda": bandwidth, "desired": {"file": table},
                 "K_D": dict(zip(mechanism.independent, (bandwidth * inertia).tolist(), strict=True))}  # fmt: skip
@@ -215,11 +304,14 @@ class Plan(HasSummary):
     def save(self, folder: str | Path, *, overwrite: bool = False) -> list[Path]:
         """Write open.scene.toml, closed.scene.toml, plan.csv and plan.json into a folder (InputError).
 
-        A motion that crosses singular configurations has no closed.scene.toml.
+        Scenes of `sections` are in folders of their own, part_1 and so on. A motion that crosses singular
+        configurations has no closed.scene.toml.
         """
         folder = Path(folder)
-        controls = ("open", "closed") if self.can_be_tracked else ("open",)
-        scenes = [self.scene(name).save(folder, name, overwrite=overwrite or name == "closed") for name in controls]
+        parts = {folder / f"part_{k + 1}": self.part(k) for k in range(len(self.sections))} or {folder: self}
+        scenes = [part.scene(name).save(place, name, overwrite=overwrite or name == "closed")
+                  for place, part in parts.items() for name in ("open", "closed")
+                  if name == "open" or self.can_be_tracked]  # fmt: skip
         files = [*scenes, self.to_csv(folder / "plan.csv"), folder / "plan.json"]
         write_atomic(files[-1], to_json(self.to_dict(files)) + "\n")
         return files
@@ -231,16 +323,18 @@ class Plan(HasSummary):
                    for k, name in enumerate(self.mechanism.motors.names)]  # fmt: skip
         reached = [f"{x.quantity} {x.side}, {x.begin:.3g} to {x.end:.3g} s" for x in self.active]
         crossed = [f"at {x.t:.4g} s, unbalanced force {x.unbalanced:.1e}" for x in self.crossings]
+        periods = "" if self.cycle is None else f"{self.cycle.periods} periods, "
         rows: list[Row] = [
             ("status", f"{self.status}: {self.message}"),
             ("duration", f"{self.t_end:.6g} s"),
+            *([("places reached", [f"{t:.6g} s" for t in self.via_t])] if self.via_t else []),
             ("cost", f"{self.cost:.6g}: " + ", ".join(f"{name} {x:.4g}" for name, x in self.parts.items())),
             ("iterations", str(self.iterations)),
             ("largest torques", largest),
             ("sigma_min", f"at least {self.margin.min():.3g} of the start's"),
             *([("crosses singular configurations", crossed)] if crossed else []),
             ("active limits", reached or "none"),
-            ("replay", f"error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
+            ("replay", f"{periods}error {self.replay.error:.1e}, largest torque {self.replay.max_tau:.4g}, "
              f"closure of the plan {self.replay.closure:.1e}"),
         ]  # fmt: skip
         rows += [("warning", warning) for warning in self.warnings]
@@ -264,11 +358,19 @@ class Plan(HasSummary):
             "iterations": self.iterations,
             "replay": {"error": self.replay.error, "max_tau": self.replay.max_tau, "closure": self.replay.closure},
             "margin": float(self.margin.min()),
+            "via_t": list(self.via_t),
+            "periods": 1 if self.cycle is None else self.cycle.periods,
             "active": [{"quantity": x.quantity, "side": x.side, "from": x.begin, "to": x.end} for x in self.active],
             "crossings": [{"t": x.t, "unbalanced": x.unbalanced} for x in self.crossings],
             "warnings": list(self.warnings),
-            "files": [path.name for path in files or []],
+            "files": _relative_names(files or []),
         }
+
+
+def _relative_names(files: list[Path]) -> list[str]:
+    """Return paths of files relative to the folder that has all of them."""
+    folder = min((path.parent for path in files), key=lambda x: len(x.parts), default=Path())
+    return [path.relative_to(folder).as_posix() for path in files]
 
 
 def _make_scene(
@@ -291,15 +393,24 @@ def _make_scene(
     )  # fmt: skip
 
 
-def _torque_controller(mechanism: Mechanism, t: Array, torque: Array) -> dict[str, Any]:
-    """Return the controller of recorded torques."""
+def _torque_controller(mechanism: Mechanism, t: Array, torque: Array, cycle: Cycle | None) -> dict[str, Any]:
+    """Return the controller of recorded torques. Rows with the same time, where torques jump, become different ones."""
+    if cycle is not None:
+        t = np.concatenate([t + k * t[-1] for k in range(cycle.periods)])
+        torque = np.tile(torque, (cycle.periods, 1))
+    same, t, torque = np.flatnonzero(np.diff(t) == 0), np.array(t), np.array(torque)
+    for rows, neighbours in ((same, same - 1), (same + 1, same + 2)):
+        # The rows move along the lines to their neighbours, which keeps the impulse.
+        share = JUMP_GAP * t[-1] / 2 / np.abs(t[neighbours] - t[rows])
+        torque[rows] += share[:, None] * (torque[neighbours] - torque[rows])
+        t[rows] += share * (t[neighbours] - t[rows])
     columns = {"t": t, **dict(zip(mechanism.motors.names, torque.T, strict=True))}
     return {"type": "torques", "file": columns, "interpolation": "linear"}
 
 
 def replay_plan(
     mechanism: Mechanism, dynamics: ReducedDynamics, motion: CoordinateMotion, at: MotionInstants, t: Array,
-    torque: Array,
+    torque: Array, cycle: Cycle | None = None, sections: tuple[Section, ...] = (),
 ) -> Replay:  # fmt: skip
     """Simulate a plan's torques and compare the end with the plan's.
 
@@ -312,15 +423,47 @@ def replay_plan(
     at : MotionInstants
         The motion from its start on.
     t, torque : (k,) and (k, motors) arrays
+    cycle : Cycle, optional
+        Of a motion that repeats.
+    sections : tuple of Section
+        Parts of the motion with different parameters. Each begins at the end of the one before.
     """
-    numbers, q_at = mechanism.tree.to_coordinates(at.q_tree[0]), dynamics.q_at
-    crosses = dynamics.mechanism.independent != mechanism.independent
-    run = simulate(_make_scene(mechanism, numbers, at.v_tree[0], float(motion.corners[-1]),
-                               _torque_controller(mechanism, t, torque), "open", crosses=crosses))  # fmt: skip
-    q, rates, _ = motion(motion.corners[-1:])
-    error = max(np.abs(run.q_tree[-1, q_at] - q[0]).max(), np.abs(run.v_tree[-1, q_at] - rates[0]).max())
+    crosses, q_at = dynamics.mechanism.independent != mechanism.independent, dynamics.q_at
+    parts = [(mechanism, motion, t, torque, cycle)]
+    if sections:
+        parts = [(x.mechanism, *_cut(motion, t, torque, x), None) for x in sections]
+        parts *= 1 if cycle is None else cycle.periods
+    numbers, rates, max_tau = mechanism.tree.to_coordinates(at.q_tree[0]), at.v_tree[0], 0.0
+    for model, part, part_t, part_torque, part_cycle in parts:
+        controller = _torque_controller(model, part_t, part_torque, part_cycle)
+        t_end = float(part.corners[-1]) * (1 if part_cycle is None else part_cycle.periods)
+        run = simulate(_make_scene(model, numbers, rates, t_end, controller, "open", crosses=crosses))
+        numbers, rates = run.q_tree[-1], run.v_tree[-1]
+        max_tau = max(max_tau, float(np.abs(run.tau).max(initial=0.0)))
+    q, q_dot, _ = motion(motion.corners[-1:])
+    if cycle is not None:
+        q = q + (cycle.periods - 1) * cycle.turns
+    error = max(np.abs(numbers[q_at] - q[0]).max(), np.abs(rates[q_at] - q_dot[0]).max())
     closure = float(np.abs(dynamics.residual(at.q_tree)).max(initial=0.0))
-    return Replay(float(error), float(np.abs(run.tau).max(initial=0.0)), closure)
+    return Replay(float(error), max_tau, closure)
+
+
+def _cut(motion: CoordinateMotion, t: Array, torque: Array, section: Section) -> tuple[CoordinateMotion, Array, Array]:
+    """Return a motion and rows of torques from the beginning of a section to its end, over the time since then.
+
+    Of two rows at the beginning, the second one belongs to the section, and of two at the end the first one.
+    """
+    begin, end, tolerance = section.begin, section.end, CUT_TOLERANCE * float(t[-1])
+    first, last = np.flatnonzero(t <= begin + tolerance)[-1], np.flatnonzero(t >= end - tolerance)[0]
+    t, torque = t[first : last + 1] - begin, torque[first : last + 1]
+    assert isinstance(motion, PiecewisePolynomial)
+    middles = (motion.breaks[1:] + motion.breaks[:-1]) / 2
+    pieces = np.flatnonzero((middles > begin) & (middles < end))
+    breaks = motion.breaks[pieces[0] : pieces[-1] + 2] - begin
+    t[[0, -1]] = breaks[[0, -1]] = 0.0, end - begin
+    part = PiecewisePolynomial(breaks, motion.coefficients[:, pieces], corners=breaks,
+                               max_frequency=motion.max_frequency, end=end - begin)  # fmt: skip
+    return part, t, torque
 
 
 def measure(

@@ -18,21 +18,14 @@ from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.collocation import Collocation
+from ckc_pin.optimization.end_states import refuse_unsupported, resolve_state
+from ckc_pin.optimization.first_guess import guess_motion, interpolation, sample_motion
 from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.ipopt import Ipopt, Optimum
 from ckc_pin.optimization.limits import make_limits
-from ckc_pin.optimization.mesh_motion import Ends, Guess, Solution
+from ckc_pin.optimization.mesh_motion import Guess, Mesh, Places, Solution
 from ckc_pin.optimization.optimize import read_arguments
-from ckc_pin.optimization.point_to_point import (
-    gauss_places,
-    guess_motion,
-    interpolation,
-    read_desired_motion,
-    refuse_unsupported,
-    require_solved,
-    resolve_state,
-    sample_motion,
-)
+from ckc_pin.optimization.point_to_point import read_desired_motion, require_solved
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import StateSpec
 from ckc_pin.run.state import State
@@ -149,7 +142,7 @@ class Planner:
         self._desired = (
             None if spec.desired is None else read_desired_motion(spec.desired, self.mechanism, sources, 0.0)
         )
-        self._mesh = np.linspace(0.0, 1.0, intervals + 1)
+        self._mesh = Mesh(np.linspace(0.0, 1.0, intervals + 1))
         self._problem: Collocation | None = None
         self._last: tuple[HorizonPlan, Optimum] | None = None
         self._q_tree = self.mechanism.q_tree
@@ -183,7 +176,7 @@ class Planner:
                 raise
         motion = solution.motion()
         plan = HorizonPlan(
-            t_start=t, t_end=t + solution.values.duration, cost=solution.cost, parts=solution.parts,
+            t_start=t, t_end=t + float(solution.values.ends[-1]), cost=solution.cost, parts=solution.parts,
             iterations=solution.iterations, wall_s=perf_counter() - begin, motion=motion, torque_t=motion.corners,
             torque=np.clip(solution.values.torque, *self._limits.torque),
         )  # fmt: skip
@@ -205,19 +198,21 @@ class Planner:
 
     def _optimize(self, t: float, q: Array, rates: Array) -> tuple[Solution, Optimum]:
         guess = self._guess(t, q, rates)
+        free, end = np.full(self.mechanism.d, np.nan), self._end
+        places = Places(
+            np.array([q, free if end is None else end.q]), np.array([rates, free if end is None else end.rates]),
+            np.array([0.0, self.horizon or np.nan]),
+        )  # fmt: skip
+        desired = None if self._desired is None else self._desired(t + guess.ends[-1] * self._mesh.gauss_places())
         if self._problem is None:
-            self._problem = Collocation(self._dynamics, self._limits, self._minimize, guess, self._q_tree,
-                                        fixed_duration=self.horizon is not None)  # fmt: skip
+            self._problem = Collocation(
+                self._dynamics, self._limits, self._minimize, guess, self._q_tree, places, desired
+            )
             self._cold, self._warm = (
                 Ipopt(self._problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=warm)
                 for warm in (False, True)
             )
-        free, end = np.full(self.mechanism.d, np.nan), self._end
-        ends = Ends(
-            np.array([q, free if end is None else end.q]), np.array([rates, free if end is None else end.rates])
-        )
-        desired = None if self._desired is None else self._desired(t + guess.duration * gauss_places(self._mesh))
-        self._problem.set_ends(ends, desired)
+        self._problem.set_places(places, desired)
         if self._last is not None:
             solution, optimum = self._problem.solve(guess, self._warm, self._last[1])
             if solution.is_optimum:

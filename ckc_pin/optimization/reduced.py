@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
-from ckc_pin.codegen.arguments import present, values
-from ckc_pin.codegen.expressions import term_expressions
 from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.optimization.many_instants import InstantsFunction
+from ckc_pin.optimization.motion_functions import MotionFunctions
 
 __all__ = ["Derivatives", "MotionInstants", "ReducedDynamics"]
 
@@ -82,6 +80,8 @@ class ReducedDynamics:
         there is none, or that of `directions`.
     directions : (m, n) array, optional
         Signs of the rates that dry friction opposes at the instants of a motion.
+    state_symbols : tuple of casadi.SX
+        q', v', dv'/dt and tau.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class ReducedDynamics:
 
     def __init__(self, mechanism: Mechanism) -> None:
         try:
-            import casadi as cs
+            import casadi
         except ModuleNotFoundError as error:
             raise InputError("optimize needs CasADi, which is not installed: pip install ckc_pin[symbolic]") from error
         tree = mechanism.tree
@@ -104,57 +104,26 @@ class ReducedDynamics:
         self.q_at, self.z_at = mechanism.partition.q, mechanism.partition.z
         self.q_in_tree = tree.q_index[self.q_at]
         self.z_in_tree = np.setdiff1d(np.arange(tree.nq), self.q_in_tree)
-        terms, numbers = term_expressions(mechanism), model_numbers(mechanism)
-        parameters = cs.DM(values(numbers, present(numbers)))
-        q, v, a = terms.configuration.q, terms.v, terms.v_dot
-        kept = list(terms.kept)
-        norms = [(cs.sumsqr(q[start : start + 4]) - 1) / 2 for start in terms.quaternions]
-        multipliers, tau = cs.SX.sym("multipliers", len(kept)), cs.SX.sym("tau", self.motors)
-        transmission = cs.sparsify(cs.DM(mechanism.motors.transmission))
+        self._functions = MotionFunctions(mechanism)
 
-        def substitute(x: Any) -> Any:
-            return cs.substitute(terms.configuration.as_function_of_q(x), terms.arguments.vector, parameters)
+        self.state_symbols = tuple(
+            casadi.SX.sym(name, size)
+            for name, size in (("q", tree.nq), ("v", self.n), ("v_dot", self.n), ("tau", self.motors))
+        )
 
-        J = substitute(terms.rows.J)[kept, :]
-        phi = cs.vertcat(substitute(terms.rows.phi)[kept], *norms)
-        J_dot_v = substitute(terms.rows.J_dot_v)[kept]
-        acceleration = cs.mtimes(J, a) + J_dot_v
-        passive = substitute(terms.inverse_dynamics - terms.damping)
-        balance = passive - cs.mtimes(transmission.T, tau) - cs.mtimes(J.T, multipliers)
-        self._symbols = q, v, a, multipliers
-        self.state_symbols = q, v, a, tau
-        self.phi_z = J[:, self.z_at.tolist()]
-        self.points = substitute(terms.points[0])
-        self._rows = phi, cs.mtimes(J, v), acceleration, balance
-        self._closure = InstantsFunction.of([q], [phi, cs.jacobian(phi, q)])
-        self._rates = InstantsFunction.of([q, v], [J, J_dot_v])
-        self._passive = InstantsFunction.of([q, v, a], [passive])
+    @cached_property
+    def phi_z(self) -> Any:
+        """CasADi expression of phi_z."""
+        return self._functions.jacobian_at(self.state_symbols[0])[:, self.z_at.tolist()]
+
+    @cached_property
+    def points(self) -> Any:
+        """CasADi expression of the positions of the named points, a column of 3 per point."""
+        return self._functions.points_at(self.state_symbols[0])
 
     @cached_property
     def _points(self) -> InstantsFunction:
         return InstantsFunction.of([self.state_symbols[0]], [self.points])
-
-    @cached_property
-    def _first(self) -> InstantsFunction:
-        """First derivatives of rows, their rates and accelerations, and of the forces' balance."""
-        import casadi as cs
-
-        (q, v, a, _), (phi, rate, acceleration, balance) = self._symbols, self._rows
-        by = ((phi, q), (rate, v), (rate, q), (acceleration, q), (acceleration, v), (balance, q), (balance, v),
-              (balance, a))  # fmt: skip
-        return InstantsFunction.of(list(self._symbols), [cs.jacobian(x, y) for x, y in by])
-
-    @cached_property
-    def _second(self) -> InstantsFunction:
-        """Second derivatives of a weighted sum of the same."""
-        import casadi as cs
-
-        q, v, a, multipliers = self._symbols
-        weights = [cs.SX.sym(f"w_{k}", x.numel()) for k, x in enumerate(self._rows)]
-        lagrangian = sum(cs.dot(w, x) for w, x in zip(weights, self._rows, strict=True))
-        by_q, by_v = cs.gradient(lagrangian, q), cs.gradient(lagrangian, v)
-        pairs = ((by_q, q), (by_q, v), (by_v, v), (by_q, a), (by_q, multipliers))
-        return InstantsFunction.of([*self._symbols, *weights], [cs.jacobian(x, y) for x, y in pairs])
 
     # --- values ----------------------------------------------------------------------------------
 
@@ -169,7 +138,7 @@ class ReducedDynamics:
         if not far < MAX_PIECES * MAX_CONTINUATION_STEP:
             return None
         count = 1 + int(far / step)
-        _, jacobian = self._closure(q_tree)
+        _, jacobian = self._functions.closure(q_tree)
         signs = np.sign(np.linalg.det(jacobian[:, :, self.z_in_tree]))
         for k in range(1, count + 1):
             target = start + (q - start) * (k / count)
@@ -210,11 +179,11 @@ class ReducedDynamics:
 
     def residual(self, q_tree: Array) -> Array:
         """Return phi of the independent rows and of quaternions' norms at configurations (m, nq), (m, rows)."""
-        return self._closure(q_tree)[0][:, :, 0]
+        return self._functions.closure(q_tree)[0][:, :, 0]
 
     def _newton(self, q_tree: Array) -> tuple[Array, Array] | None:
         for _ in range(MAX_NEWTON_STEPS):
-            phi, jacobian = self._closure(q_tree)
+            phi, jacobian = self._functions.closure(q_tree)
             size = np.abs(phi).max(initial=0.0)
             if not np.isfinite(size):
                 return None
@@ -249,7 +218,7 @@ class ReducedDynamics:
 
     def jacobians(self, q_tree: Array) -> Array:
         """Return the independent rows of J at configurations (m, nq), (m, rows, n)."""
-        return self._rates(q_tree, np.zeros((len(q_tree), self.n)))[0]
+        return self._functions.rates(q_tree, np.zeros((len(q_tree), self.n)))[0]
 
     def smallest_singular_values(self, q_tree: Array, z_at: IntArray | None = None) -> Array:
         """Return smallest singular values of phi_z at configurations (m, nq); 1 without loops.
@@ -278,13 +247,13 @@ class ReducedDynamics:
     def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
         """Return a motion at closed configurations with rates and accelerations (m, d) and torques (m, motors)."""
         v_tree, a_tree = np.zeros((2, len(q_tree), self.n))
-        J, _ = self._rates(q_tree, v_tree)
+        J, _ = self._functions.rates(q_tree, v_tree)
         inverse = _inverse(J[:, :, self.z_at])
         v_tree[:, self.q_at], a_tree[:, self.q_at] = v, a
         v_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], v))
-        _, J_dot_v = self._rates(q_tree, v_tree)
+        _, J_dot_v = self._functions.rates(q_tree, v_tree)
         a_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], a) + J_dot_v[:, :, 0])
-        (passive,) = self._passive(q_tree, v_tree, a_tree)
+        (passive,) = self._functions.forces(q_tree, v_tree, a_tree)
         force = passive[:, :, 0] + self._friction(v_tree)[0] - tau @ self.mechanism.motors.transmission
         multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
         missing = force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
@@ -307,7 +276,7 @@ class ReducedDynamics:
     def differentiate(self, at: MotionInstants) -> Derivatives:
         """Return the derivatives of a motion's quantities by q, q_dot, q_ddot and tau of each instant."""
         m, d, n, q_at, z_at = len(at.q_tree), self.d, self.n, self.q_at, self.z_at
-        blocks = self._first(at.q_tree, at.v_tree, at.a_tree, at.multipliers)
+        blocks = self._functions.first(at.q_tree, at.v_tree, at.a_tree, at.multipliers)
         phi_q, J, rate_q, acc_q, acc_v, balance_q, balance_v, balance_a = blocks
         balance_v[:, np.arange(n), np.arange(n)] += self._friction(at.v_tree)[1]
         size = 3 * d + self.motors
@@ -358,7 +327,7 @@ class ReducedDynamics:
         by_q += extra[:, :nq]
         inverse_q = _inverse(phi_q[:, :, self.z_in_tree])
         w_phi = -_times(inverse_q.transpose(0, 2, 1), by_q[:, self.z_in_tree])
-        qq, qv, vv, qa, ql = self._second(
+        qq, qv, vv, qa, ql = self._functions.second(
             at.q_tree, at.v_tree, at.a_tree, at.multipliers, w_phi, w_rate, w_acceleration, w_balance
         )
         vv[:, np.arange(n), np.arange(n)] += w_balance * self._friction(at.v_tree)[2]

@@ -19,8 +19,10 @@ __all__ = [
     "MinimizeSpec",
     "OptimizeSpec",
     "PathSpec",
+    "PeriodicSpec",
     "SphereSpec",
     "StateSpec",
+    "ViaSpec",
     "make_spec",
     "read_optimize",
 ]
@@ -51,6 +53,62 @@ class StateSpec(FileStruct, frozen=True, kw_only=True):
     point: dict[str, Vector3] | None = None
     at: Literal["assembled", "equilibrium"] | None = None
     q_dot: dict[str, float] = {}
+
+
+class ViaSpec(FileStruct, frozen=True, kw_only=True):
+    """A place that a motion from ``[from]`` to ``[to]`` passes: one of q and point.
+
+    Motor torques may jump there.
+
+    Attributes
+    ----------
+    q : rad, m
+        Independent coordinates by name. The others are free.
+        ``q = {theta_1 = -1.2}``
+    point : m
+        Position of one ``[[point]]``, as in ``[to]``.
+        ``point = {plate = [0.1, 0.05, -0.3]}``
+    q_dot : rad/s, m/s
+        Rates of independent coordinates. The others are free.
+        ``q_dot = {theta_1 = 0.5}``
+    rest
+        Whether all rates are zero.
+        ``rest = true``
+    dwell : s
+        Time at rest at the place.
+        ``dwell = 0.2``
+    time : s
+        When the motion reaches the place; free if absent.
+        ``time = 0.5``
+    parameters : as the parameter's
+        Values of masses, centres of mass and inertias of links from the place on, which the motion leaves from rest.
+        ``parameters = {"link.plate.mass" = 0.3}``
+    """
+
+    q: dict[str, float] | None = None
+    point: dict[str, Vector3] | None = None
+    q_dot: dict[str, float] = {}
+    rest: bool = False
+    dwell: Weight = 0.0
+    time: Limit | None = None
+    parameters: dict[str, float | list[float]] = {}
+
+
+class PeriodicSpec(FileStruct, frozen=True, kw_only=True):
+    """A motion that repeats: it ends in the state in which it begins, up to whole turns.
+
+    Attributes
+    ----------
+    turns : 2π rad
+        Whole turns of independent coordinates in a period; 0 for the others.
+        ``turns = {crank = 1}``
+    time : s
+        The period. Default: free, as the duration of other motions.
+        ``time = 0.8``
+    """
+
+    turns: dict[str, int] = {}
+    time: Limit | None = None
 
 
 class PathSpec(FileStruct, frozen=True, kw_only=True):
@@ -210,11 +268,18 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
         Values of parameters that differ from the mechanism's files.
         ``parameters = {"link.plate.mass" = 0.3}``
     from
-        Where the motion begins; as assembled if absent.
+        Where the motion begins; as assembled if absent. A periodic motion begins anywhere if it is absent, and
+        coordinates and rates that it does not name are free.
         ``from = {at = "equilibrium"}``
     to
-        Where it ends; either this or ``path``, or both with ``path = {shape = "free"}``.
+        Where it ends; either this, ``path`` or ``periodic``, or both with ``path = {shape = "free"}``.
         ``to = {point = {plate = [0.1, 0.05, -0.3]}}``
+    via
+        Places that the motion passes on its way, in their order.
+        ``via = [{point = {plate = [0.0, 0.0, -0.27]}}]``
+    periodic
+        The motion repeats.
+        ``periodic = {turns = {crank = 1}, time = 0.8}``
     path
         The path of a time-optimal motion.
         ``path = {point = {plate = [[0.0, 0.0, -0.3], [0.1, 0.05, -0.3]]}}``
@@ -238,8 +303,10 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
 
     mechanism: str
     parameters: dict[str, float | list[float]] = {}
-    start: StateSpec = msgspec.field(name="from", default=StateSpec(at="assembled"))
+    start: StateSpec | None = msgspec.field(name="from", default=None)
     to: StateSpec | None = None
+    via: list[ViaSpec] = []
+    periodic: PeriodicSpec | None = None
     path: PathSpec | None = None
     minimize: MinimizeSpec = MinimizeSpec(time=1.0)
     limits: LimitsSpec = LimitsSpec()
@@ -259,6 +326,8 @@ def read_optimize(path: str | Path) -> tuple[OptimizeSpec, Sources]:
     path = Path(path)
     data = read_toml(read_text(path, "plan"), str(path))
     join_dotted_keys(data, "parameters")
+    for table in data["via"] if isinstance(data.get("via"), list) else ():
+        join_dotted_keys(table, "parameters")
     sources = Sources(str(path), path.parent)
     return make_spec(data, sources.name), sources
 

@@ -102,7 +102,7 @@ def _limited(dynamics: ReducedDynamics, limits: MotionLimits) -> list[Row]:
     for k, name in enumerate(motors):
         rows += [_symmetric(f"speed.{name}", speed[k], limits.speed[k]),
                  _symmetric(f"power.{name}", power[k], limits.power[k])]  # fmt: skip
-    points = dict(zip(mechanism.points, cs.vertsplit(dynamics.points, 3), strict=True))
+    points = dict(zip(mechanism.points, cs.vertsplit(dynamics.points, 3), strict=True)) if limits.spheres else {}
     for label, (point, centre, radius) in zip(limits.sphere_names, limits.spheres, strict=True):
         # The distance is nearly linear in the position; a small part of the radius makes it smooth at the centre.
         distance = cs.sqrt(cs.sumsqr(points[point] - cs.DM(centre)) + (ROUNDING * radius) ** 2)

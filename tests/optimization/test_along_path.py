@@ -152,7 +152,7 @@ def test_command_writes_files_and_prints_json(tmp_path: Path) -> None:
     assert answer.code == 0
     result = json.loads(answer.out)
     assert set(result) == {"name", "status", "message", "t_end", "cost", "parts", "iterations", "replay", "margin",
-                           "active", "crossings", "warnings", "files"}  # fmt: skip
+                           "via_t", "periods", "active", "crossings", "warnings", "files"}  # fmt: skip
     assert set(result["replay"]) == {"error", "max_tau", "closure"}
     assert {x.name for x in (tmp_path / "plan").iterdir()} >= set(result["files"])
     assert "plan.png" in result["files"]

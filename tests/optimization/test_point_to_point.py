@@ -15,7 +15,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.optimization.collocation import Collocation
 from ckc_pin.optimization.limits import make_limits
-from ckc_pin.optimization.mesh_motion import Ends, Guess, gauss_points
+from ckc_pin.optimization.mesh_motion import Guess, Mesh, Places
 from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.spec import KeepOutSpec, LimitsSpec, MinimizeSpec, SphereSpec
 from tests.analytic.five_bar import FiveBar
@@ -132,23 +132,28 @@ EVERY_LIMIT: dict[str, Any] = {
         ("slider_crank", {}),
     ],
 )  # fmt: skip
-def test_derivatives_of_the_nonlinear_program_are_exact(name: str, limits: dict[str, Any]) -> None:
+@pytest.mark.parametrize("phases", [1, 2])
+def test_derivatives_of_the_nonlinear_program_are_exact(name: str, limits: dict[str, Any], phases: int) -> None:
     mechanism = as_mechanism(name, "test")
     dynamics, random, count, d = ReducedDynamics(mechanism), np.random.default_rng(0), 4, mechanism.d
-    start, duration, motors = mechanism.independent_part(mechanism.q_tree), 0.5, len(mechanism.motors.names)
-    mesh = np.linspace(0.0, 1.0, count + 1)
-    points = (mesh[:-1, None] + np.diff(mesh)[:, None] * gauss_points()[0]).ravel()
-    way = random.uniform(-0.2, 0.2, d)
-    q_tree = dynamics.follow(mechanism.q_tree, start + np.outer(points, way))
+    start, motors = mechanism.independent_part(mechanism.q_tree), len(mechanism.motors.names)
+    mesh = Mesh(np.linspace(0.0, phases, count + 1))
+    way = random.uniform(-0.2, 0.2, d) / phases
+    q_tree = dynamics.follow(mechanism.q_tree, start + np.outer(mesh.gauss_places(), way))
     assert q_tree is not None
     guess = Guess(
-        mesh, duration, start + np.outer(mesh, way), np.tile(way / duration, (count + 1, 1)),
-        random.normal(size=(count, 3, d)), random.normal(size=(count + 1, motors)), q_tree,
+        mesh, random.uniform(0.3, 0.6, phases), start + np.outer(mesh.knots, way), np.tile(way / 0.5, (count + 1, 1)),
+        random.normal(size=(count, 3, d)), random.normal(size=(count + phases, motors)), q_tree,
+    )  # fmt: skip
+    other = {"gravity": [1.0, -2.0, 3.0]}
+    members = [dynamics, ReducedDynamics(ckc_pin.load(name, other))] if phases > 1 else []
+    places = Places(
+        guess.q[:: count // phases], random.normal(size=(phases + 1, d)), np.full(phases + 1, np.nan),
+        turns=random.normal(size=d) if phases > 1 else None, jumps=False, jumps_at_start=False,
     )  # fmt: skip
     weights = MinimizeSpec(time=1.0, effort=0.1, energy=0.2, jerk=1e-4, peak_torque=0.3, tracking=0.7)
     problem = Collocation(dynamics, make_limits(LimitsSpec(**EVERY_LIMIT | limits), mechanism), weights, guess,
-                          mechanism.q_tree)  # fmt: skip
-    problem.set_ends(Ends(guess.q[[0, -1]], guess.rates[[0, -1]]), random.normal(size=(3 * count, d)))
+                          mechanism.q_tree, places, random.normal(size=(3 * count, d)), members)  # fmt: skip
     w = problem.pack(guess)
     multipliers = random.normal(size=problem.rows)
 
