@@ -148,6 +148,9 @@ class Members:
     count : int
         Number of members, which decides whether compiling terms saves time.
     threads : int
+    lanes : bool
+        Whether a thread computes several members at a time with compiled terms, in the lanes of the processor's vector
+        registers. Results do not depend on it.
 
     Raises
     ------
@@ -163,9 +166,11 @@ class Members:
         outputs: Mapping[str, str | OutputSpec | Function],
         count: int,
         threads: int,
+        *,
+        lanes: bool = True,
     ) -> None:
         self._overrides, self.names = dict(overrides), names
-        self._threads = threads
+        self._threads, self._lanes = threads, lanes
         self.scene = as_scene(scene, overrides, "ensemble")
         self.ready = prepare(self.scene)
         self.mechanism = self.ready.mechanism
@@ -414,14 +419,14 @@ class Members:
         if terms == "pinocchio":
             return None
         if terms == "generated":
-            return compile_terms(self.mechanism, which=varying_arguments, of_members=True)
-        library = find_compiled_terms(self.mechanism, varying_arguments, of_members=True)
+            return compile_terms(self.mechanism, which=varying_arguments, of_members=self._lanes)
+        library = find_compiled_terms(self.mechanism, varying_arguments, of_members=self._lanes)
         if library is not None or count < 2 or explain_too_large(self.mechanism):
             return library
         if count * self.count_rhs() < MIN_RHS_TO_COMPILE * self.mechanism.n:
             return None
         try:
-            return compile_terms(self.mechanism, which=varying_arguments, of_members=True)
+            return compile_terms(self.mechanism, which=varying_arguments, of_members=self._lanes)
         except InputError:  # without a compiler or CasADi, Pinocchio's terms are used
             return None
 

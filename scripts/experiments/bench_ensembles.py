@@ -17,7 +17,6 @@ import ckc_pin
 from ckc_pin.analysis.precision.mujoco import INTEGRATORS, STIFFNESSES, StateMap, configure_model, load_model
 from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.c_source import MEMBERS
-from ckc_pin.codegen.library import compile_terms
 from ckc_pin.ensembles.members import Members
 from ckc_pin.formats.exporting import export
 
@@ -48,10 +47,7 @@ def run_members(
 ) -> tuple[float, float, Array]:
     """Run members of the ensemble: wall time and processor time in s, and q_tree at the end."""
     overrides = {"solver.rtol": rtol, "solver.terms": terms}
-    members = Members(SCENE, overrides, names, {"end": "q_tree"}, len(values), threads)
-    if terms == "generated" and not lanes:  # take a library without the function of several members
-        members._library = compile_terms(members.mechanism, members._numbers.which)
-    return timed(members, values)
+    return timed(Members(SCENE, overrides, names, {"end": "q_tree"}, len(values), threads, lanes=lanes), values)
 
 
 def table(count: int, threads: int) -> None:

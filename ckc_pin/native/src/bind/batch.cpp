@@ -27,7 +27,7 @@ using Counts = nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>;
 
 constexpr std::int64_t not_started = -1;
 constexpr double polling_interval = 0.05;  // s, after which a thread checks whether it should stop
-constexpr double after_each_step = -1.0;   // a pause after each step
+constexpr double after_each_attempt = -1.0;  // a pause before the first step and after each attempt of a step
 
 struct ParameterColumns {
   Core::Parameter kind;
@@ -188,7 +188,9 @@ class Batch {
         for (std::int64_t k; worker.member == not_started && (k = next++) < task.members;)
           if (start_member(worker, task, k)) {
             worker.member = k;
-            if (has_lanes) team.lanes.set_constants(static_cast<int>(lane), worker.loop.core->compiled->constants());
+            if (!has_lanes) continue;
+            team.lanes.set_constants(static_cast<int>(lane), worker.loop.core->compiled->constants());
+            advance_member(worker, task, after_each_attempt, cancelled);
           }
         attempts[lane] = {};
         if (worker.member == not_started) continue;
@@ -196,16 +198,18 @@ class Batch {
         if (has_lanes) attempts[lane] = step_loop.prepare_explicit_step();
       }
       if (has_lanes) team.lanes.compute(attempts);
-      for (auto& worker : team.workers) {
-        if (worker->member == not_started) continue;
-        const double pause = has_lanes ? after_each_step : polling_interval;
-        const Stop stop =
-            worker->loop.step_loop->advance(task.until, true, pause, std::numeric_limits<double>::infinity());
-        if (stop.reason == Stop::pause && !cancelled) continue;
-        finish_member(*worker, task, stop);
-        worker->member = not_started;
-      }
+      for (auto& worker : team.workers)
+        if (worker->member != not_started)
+          advance_member(*worker, task, has_lanes ? after_each_attempt : polling_interval, cancelled);
     }
+  }
+
+  // Advance a worker's member up to the next pause or its end.
+  void advance_member(Worker& worker, const EnsembleTask& task, double pause, const std::atomic<bool>& cancelled) const {
+    const Stop stop = worker.loop.step_loop->advance(task.until, true, pause, std::numeric_limits<double>::infinity());
+    if (stop.reason == Stop::pause && !cancelled) return;
+    finish_member(worker, task, stop);
+    worker.member = not_started;
   }
 
   static auto row_of(const Numbers& x, std::int64_t member, Eigen::Index size) {

@@ -141,6 +141,7 @@ double Explicit::error(double h) {
 }
 
 double Explicit::next_step_size(double t_bound) const {
+  if (is_repeating()) return repeat_size_;
   const double min_size = min_step_size(t_bound);
   return std::clamp(step_.h, min_size, std::max(min_size, tolerance_.max_step));
 }
@@ -151,43 +152,37 @@ double Explicit::order_five_step_size() const {
 
 bool Explicit::make_step(double t_bound) {
   const double min_size = min_step_size(t_bound), exponent = -1.0 / (error_order() + 1);
-  double step_size = next_step_size(t_bound);
-  has_dense_output_ = false;
-  bool rejected = false;
-  for (;;) {
-    if (!(step_size >= min_size)) return false;
-    step_.t_new = std::min(step_.t + step_size, t_bound);
-    const double h = step_.t_new - step_.t;
-    step_size = h;
-    const bool exists = stages(h);
-    if (!exists && must_stop()) return false;
-    double size = exists ? error(h) : std::numeric_limits<double>::infinity();
-    bool agrees = true;
-    double disagreement_size = 0.0;
-    if (exists && checks_full_motion(h)) {
-      x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
-      disagreement_size = disagreement(x_stage_);
-      agrees = disagreement_size < 1.0;
-      if (!agrees) size = std::max(size, disagreement_size);
-    }
-    if (size < 1.0) {
-      const double max_growth = rejected ? 1.0 : max_factor;
-      double factor =
-          length_safety * (size == 0.0 ? max_growth : std::min(max_growth, safety * std::pow(size, exponent)));
-      // A disagreement between y and its rates may be rounding, which shorter steps do not reduce. Do not try a
-      // longer step.
-      if (disagreement_size > max_disagreement_for_growth) factor = std::min(factor, 1.0);
-      growth_next_ = step_.t_new < t_bound && factor > max_single_growth;
-      step_.h_next = step_size * (growth_next_ && !growth_pending_ ? max_single_growth : factor);
-      if (step_.t_new == t_bound && !rejected) step_.h_next = std::max(step_.h_next, step_.h);
-      if (kind_ == rk45) order_five_size_ = step_size * length_safety * safety, order_five_error_ = size;
-      return true;
-    }
-    if (!agrees && !return_to_start()) return false;
-    step_size *= std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
-    rejected = true;
-    ++work_.rejected;
+  const double step_size = next_step_size(t_bound);
+  const bool is_repeat = is_repeating();
+  has_dense_output_ = false, repeat_size_ = 0.0;
+  if (!(step_size >= min_size)) return false;
+  step_.t_new = std::min(step_.t + step_size, t_bound);
+  const double h = step_.t_new - step_.t;
+  const bool exists = stages(h);
+  if (!exists && must_stop()) return false;
+  double size = exists ? error(h) : std::numeric_limits<double>::infinity();
+  bool agrees = true;
+  double disagreement_size = 0.0;
+  if (exists && checks_full_motion(h)) {
+    x_stage_.noalias() = h * X_.leftCols(stages_) * B_;
+    disagreement_size = disagreement(x_stage_);
+    agrees = disagreement_size < 1.0;
+    if (!agrees) size = std::max(size, disagreement_size);
   }
+  if (!(size < 1.0)) {
+    if (!agrees && !return_to_start()) return false;
+    repeat_size_ = h * std::max(min_factor, exists ? safety * std::pow(size, exponent) : 0.0);
+    return ++work_.rejected, false;
+  }
+  const double max_growth = is_repeat ? 1.0 : max_factor;
+  double factor = length_safety * (size == 0.0 ? max_growth : std::min(max_growth, safety * std::pow(size, exponent)));
+  // A disagreement between y and its rates may be rounding, which shorter steps do not reduce. Do not try a longer step.
+  if (disagreement_size > max_disagreement_for_growth) factor = std::min(factor, 1.0);
+  growth_next_ = step_.t_new < t_bound && factor > max_single_growth;
+  step_.h_next = h * (growth_next_ && !growth_pending_ ? max_single_growth : factor);
+  if (step_.t_new == t_bound && !is_repeat) step_.h_next = std::max(step_.h_next, step_.h);
+  if (kind_ == rk45) order_five_size_ = h * length_safety * safety, order_five_error_ = size;
+  return true;
 }
 
 void Explicit::reject_step(double step_size) {

@@ -20,10 +20,11 @@ class Explicit : public Method {
   bool interpolate(double t, Out y) override;
   void reject_step(double step_size) override;
   void accept_step() override;
-  void reset_history() override { growth_pending_ = start_is_computed_ = false, computed_.h = 0.0; }
+  void reset_history() override { growth_pending_ = start_is_computed_ = false, computed_.h = repeat_size_ = 0.0; }
+  bool is_repeating() const override { return repeat_size_ > 0.0; }
   const char* name() const override { return kind_ == dop853 ? "DOP853" : "RK45"; }
   int error_order() const override { return kind_ == dop853 ? 7 : 4; }
-  // Size of the next step that `make_step` will try first.
+  // Size of the next step that `make_step` will try.
   double next_step_size(double t_bound) const;
   // Step size of RK45, estimated from the error of the last step.
   double order_five_step_size() const;
@@ -54,6 +55,7 @@ class Explicit : public Method {
   Computed computed_;
   bool rates_are_computed_ = false;  // whether the rates at the stages are those of computed_, and not in K_
   bool has_dense_output_ = false;
+  double repeat_size_ = 0.0;  // s, size with which the rejected step is repeated; 0 if the last step was not rejected
   // Whether the last accepted step, and the new one, ask for a growth of more than max_single_growth.
   bool growth_pending_ = false, growth_next_ = false;
   double order_five_size_ = 0.0, order_five_error_ = 1.0;  // of the last step: its size, reduced for safety, and error

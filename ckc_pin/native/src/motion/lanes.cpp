@@ -15,24 +15,27 @@ namespace {
 constexpr int width = Lanes::width;
 using Members = CompiledTerms::Members;
 
+// The numbers of all lanes as one vector. The compiler would vectorize loops over lanes along another loop.
+typedef double Vector8 __attribute__((vector_size(sizeof(Members)), may_alias));
+Vector8& vector_of(Members& x) { return reinterpret_cast<Vector8&>(x); }
+const Vector8& vector_of(const Members& x) { return reinterpret_cast<const Vector8&>(x); }
+
 // sum = start + factors[0] * rates[0] + ... of vectors of `size` numbers
 WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* const* rates, const Members* factors,
                                         int count, int size, Members* sum) {
   constexpr int block_size = 4;  // numbers whose sums stay in registers, and do not wait for one another
   int k = 0;
   for (; k + block_size <= size; k += block_size) {
-    Members x[block_size];
-    std::copy_n(&start[k], block_size, x);
+    Vector8 x[block_size];
+    for (int j = 0; j < block_size; ++j) x[j] = vector_of(start[k + j]);
     for (int i = 0; i < count; ++i)
-      for (int j = 0; j < block_size; ++j)
-        for (int lane = 0; lane < width; ++lane) x[j].of[lane] += factors[i].of[lane] * rates[i][k + j].of[lane];
-    std::copy_n(x, block_size, &sum[k]);
+      for (int j = 0; j < block_size; ++j) x[j] += vector_of(factors[i]) * vector_of(rates[i][k + j]);
+    for (int j = 0; j < block_size; ++j) vector_of(sum[k + j]) = x[j];
   }
   for (; k < size; ++k) {
-    Members x = start[k];
-    for (int i = 0; i < count; ++i)
-      for (int lane = 0; lane < width; ++lane) x.of[lane] += factors[i].of[lane] * rates[i][k].of[lane];
-    sum[k] = x;
+    Vector8 x = vector_of(start[k]);
+    for (int i = 0; i < count; ++i) x += vector_of(factors[i]) * vector_of(rates[i][k]);
+    vector_of(sum[k]) = x;
   }
 }
 
@@ -50,9 +53,9 @@ WITH_WIDEST_REGISTERS void add_squares(const Members* error, const Members* from
 
 // Members all of whose numbers are finite get 0, the others NaN.
 WITH_WIDEST_REGISTERS void find_not_finite(const Members* x, int size, Members& result) {
-  result = {};
-  for (int k = 0; k < size; ++k)
-    for (int lane = 0; lane < width; ++lane) result.of[lane] += 0.0 * x[k].of[lane];
+  Vector8 sum = {};
+  for (int k = 0; k < size; ++k) sum += 0.0 * vector_of(x[k]);
+  vector_of(result) = sum;
 }
 
 }  // namespace

@@ -147,7 +147,9 @@ Stop StepLoop::advance(double until, bool final, double pause, double budget) {
     const double bound = next_instant < until - time_tolerance ? next_instant : until;
     if (bound + reach_beyond_ != segment_end_)
       choose_explicit_method(bound + reach_beyond_), segment_end_ = bound + reach_beyond_;
+    const bool is_start = !method_;
     if (const auto stop = prepare_step(bound + reach_beyond_)) return *stop;
+    if (is_start && pause < 0.0) return is_paused_ = true, Stop{Stop::pause, now.t};
     while (now.t < bound) {
       const double t_before = now.t;
       if (const auto stop = make_step(bound + reach_beyond_, final && bound == until)) {
@@ -227,7 +229,7 @@ std::optional<Stop> StepLoop::prepare_step(double bound) {
 
 std::optional<Stop> StepLoop::make_step(double bound, bool last) {
   if (const auto stop = prepare_step(bound)) return stop;
-  if (system->core.rank) {
+  if (system->core.rank && !method_->is_repeating()) {
     const double remaining =
         crossing_.time_to_crossing(end_rank_, last_step_size_, may_step_beyond_ ? infinity : bound);
     if (std::isfinite(remaining)) {
@@ -250,7 +252,7 @@ std::optional<Stop> StepLoop::make_step(double bound, bool last) {
 }
 
 std::optional<Stop> StepLoop::make_ordinary_step(double bound, bool last) {
-  if (!method_->make_step(bound)) return step_failure();
+  if (!method_->make_step(bound)) return method_->is_repeating() ? std::nullopt : std::optional(step_failure());
   system->failure = RhsFailure::none;
   if (!control->failure.message.empty() || control->failure.u.size()) control->failure = {};
   const double h = now.t_new - now.t;

@@ -50,9 +50,10 @@ class Method : public Interpolant {
  public:
   Method(System& system, Step& step, Work& work, const Tolerance& tolerance)
       : system_(system), step_(step), work_(work), tolerance_(tolerance) {}
-  // Try steps from (t, y, f) until the error of one is small enough. False if that is impossible; the state is then
-  // unchanged.
+  // Try a step from (t, y, f). False if its error is too large and the next call is to repeat it (`is_repeating`), or
+  // if no step can be made; the state is then unchanged. An implicit method repeats steps itself.
   virtual bool make_step(double t_bound) = 0;
+  virtual bool is_repeating() const { return false; }
   // Discard the last step and try another step size next.
   virtual void reject_step(double step_size) { step_.h = step_size, ++work_.rejected; }
   // Make the end of the last step the present state.
