@@ -27,7 +27,7 @@ from ckc_pin.optimization.speed_profile import (
     fastest_profile,
 )
 
-__all__ = ["PathDynamics", "find_fastest", "minimum_norm_within", "path_dynamics"]
+__all__ = ["PathDynamics", "find_fastest", "largest_path_rates", "minimum_norm_within", "path_dynamics"]
 
 MAX_SWEEPS = 12
 MAX_SLOPE_SWEEPS = 4  # then the slopes of s_ddot stay as they are, so that dampers' forces converge
@@ -136,7 +136,7 @@ def find_fastest(dynamics: ReducedDynamics, path: PathDynamics, limits: MotionLi
     """
     normals, reach = _torque_facets(dynamics, path, limits)
     labels = _facet_names(dynamics, normals.shape[1])
-    largest = _largest_b(dynamics, path, limits)
+    largest = largest_path_rates(dynamics, path, limits)
     b, slopes, sweeps = None, np.zeros(len(path.s) - 1), 0
     for sweeps in range(1, MAX_SWEEPS + 1):
         rows, names = _rows(dynamics, path, limits, normals, reach, largest, b, labels)
@@ -210,7 +210,7 @@ def _facet_names(dynamics: ReducedDynamics, count: int) -> list[str]:
     return ["the motors together"] * count
 
 
-def _largest_b(dynamics: ReducedDynamics, path: PathDynamics, limits: MotionLimits) -> Array:
+def largest_path_rates(dynamics: ReducedDynamics, path: PathDynamics, limits: MotionLimits) -> Array:
     """Return the largest s_dot^2 that limits of rates and shaft speeds admit."""
     shafts = path.v_tree @ dynamics.mechanism.motors.transmission.T
     with np.errstate(divide="ignore"):

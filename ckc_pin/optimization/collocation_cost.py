@@ -55,6 +55,12 @@ def cost_parts(problem: Collocation, w: Any, p: Any) -> dict[str, Any]:
         jerk = problem.jerks(w, problem.points)
         cubes = w[problem.T_at[np.repeat(problem.phase, DEGREE * problem.d)].tolist()] ** 3
         parts["jerk"] = integral((jerk / cubes) ** 2, problem.d)
+    if minimize.torque_rate:
+        rates = cs.SX(0)
+        for motor, unit in enumerate(problem.unit.tolist()):
+            a, b = (w[problem.tau_at[problem.begin + side, motor].tolist()] for side in (0, 1))
+            rates += unit**2 * cs.sum1((b - a) ** 2 / (cs.DM(problem.step) * of_interval))
+        parts["torque_rate"] = rates
     if minimize.peak_torque:
         parts["peak_torque"] = w[problem.peak_at] * problem.force_unit
     return parts

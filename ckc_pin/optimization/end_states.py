@@ -61,8 +61,10 @@ def refuse_unsupported(
         )
     if not mechanism.motors.names:
         raise InputError(f"optimize: {mechanism.name} has no motors; add [[motor]] or actuated to the mechanism's file")
+    others = (minimize.effort, minimize.energy, minimize.jerk, minimize.peak_torque, minimize.torque_rate)
     if (
         minimize.time
+        and not any(others)
         and not np.isfinite(
             np.concatenate(
                 [limits.torque.ravel(), limits.rate, limits.acceleration, limits.jerk, limits.power, limits.speed]

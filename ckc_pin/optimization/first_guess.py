@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, zip_longest
+from itertools import pairwise, product, zip_longest
 from typing import Any
 
 import numpy as np
@@ -115,9 +115,10 @@ def _guess_along(
     fastest = FirstGuess(way, motion, motion.corners)
     yield fastest if is_first else None
     typical = _typical_duration(_compute_path_terms(way.dynamics, path), limits, np.median)
-    for duration in dict.fromkeys(_duration(minimize, limits, factor * typical) for factor in EFFORT_GUESS_DURATIONS):
+    durations = dict.fromkeys(_duration(minimize, limits, factor * typical) for factor in EFFORT_GUESS_DURATIONS)
+    for duration, intervals in product(durations, EFFORT_GUESS_INTERVALS):
         wide = replace(limits, torque=limits.torque * WIDER, time=duration)
-        solution = _minimize_effort(way, path, wide)
+        solution = _minimize_effort(way, path, wide, intervals)
         wide_motion = solution.motion()
         torque = interpolation(solution.values.torque_t, solution.values.torque)
         yield FirstGuess(way, wide_motion, solution.values.ends, torque) if solution.is_optimum else None
@@ -125,20 +126,16 @@ def _guess_along(
         yield fastest
 
 
-def _minimize_effort(way: Way, path: CoordinatePath, limits: MotionLimits) -> Solution:
-    """Return a motion of minimum effort with the duration `limits.time`, on a mesh that is fine enough for the path."""
+def _minimize_effort(way: Way, path: CoordinatePath, limits: MotionLimits, intervals: int) -> Solution:
+    """Return a motion of minimum effort with the duration `limits.time`."""
     start, end = way.states
     smooth = SmoothMotion(path.q, start.rates, end.rates, limits.time)
     places = replace(way.route.places, t=np.array([0.0, limits.time]))
-    for intervals in EFFORT_GUESS_INTERVALS:
-        mesh = Mesh.uniform(intervals, np.array([limits.time]))
-        guess = sample_motion(way.dynamics, limits, smooth, mesh, start.at.q_tree, None)
-        problem = Collocation(way.dynamics, limits, MinimizeSpec(effort=1.0), guess, start.at.q_tree, places)
-        optimizer = Ipopt(problem, iterations=EFFORT_GUESS_ITERATIONS, tolerance=EFFORT_GUESS_TOLERANCE, warm=False)
-        solution, _ = problem.solve(guess, optimizer)
-        if solution.status != "Invalid_Number_Detected":  # The loops close along the polynomials of this mesh.
-            break
-    return solution
+    mesh = Mesh.uniform(intervals, np.array([limits.time]))
+    guess = sample_motion(way.dynamics, limits, smooth, mesh, start.at.q_tree, None)
+    problem = Collocation(way.dynamics, limits, MinimizeSpec(effort=1.0), guess, start.at.q_tree, places)
+    optimizer = Ipopt(problem, iterations=EFFORT_GUESS_ITERATIONS, tolerance=EFFORT_GUESS_TOLERANCE, warm=False)
+    return problem.solve(guess, optimizer)[0]
 
 
 def guess_motion(

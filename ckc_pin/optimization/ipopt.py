@@ -10,7 +10,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 
-__all__ = ["Ipopt", "NonlinearProgram", "Optimum", "merge_patterns", "nonzeros"]
+__all__ = ["Ipopt", "NonlinearProgram", "Optimum", "make_settings", "merge_patterns", "nonzeros"]
 
 CONSTRAINT_TOLERANCE = 1e-9
 WARM_BARRIER = 1e-6  # first barrier parameter of a warm start
@@ -88,11 +88,7 @@ class Ipopt:
             _callback("hess_lag", {**variables, "lam_f": one, "lam_g": g},
                       {"triu_hess_gamma_x_x": (hessian, lambda x: program.hessian(x[0], float(x[2][0]), x[3]))}),
         ]  # fmt: skip
-        settings: dict[str, Any] = {
-            "print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance,
-            "constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_tol": 100 * tolerance,
-            "acceptable_constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_iter": 5, "mu_strategy": "adaptive",
-        }  # fmt: skip
+        settings = make_settings(iterations, tolerance)
         if warm:
             settings |= {"warm_start_init_point": "yes", "mu_init": WARM_BARRIER, "mu_strategy": "monotone",
                          "warm_start_bound_push": 1e-8, "warm_start_mult_bound_push": 1e-8}  # fmt: skip
@@ -113,6 +109,15 @@ class Ipopt:
         x, lam_x, lam_g = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         stats = self._solver.stats()
         return Optimum(x, lam_x, lam_g, str(stats["return_status"]), int(stats["iter_count"]))
+
+
+def make_settings(iterations: int, tolerance: float) -> dict[str, Any]:
+    """Return IPOPT's options for a largest number of iterations and a relative tolerance."""
+    return {
+        "print_level": 0, "sb": "yes", "max_iter": iterations, "tol": tolerance,
+        "constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_tol": 100 * tolerance,
+        "acceptable_constr_viol_tol": CONSTRAINT_TOLERANCE, "acceptable_iter": 5, "mu_strategy": "adaptive",
+    }  # fmt: skip
 
 
 def nonzeros(matrix: Any) -> Any:

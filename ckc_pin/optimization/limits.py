@@ -60,7 +60,8 @@ class MotionLimits(Immutable):
     def narrowed(self, part: float) -> MotionLimits:
         """Return the limits of rates, accelerations and motors narrowed by a part of themselves."""
         return replace(self, rate=self.rate * (1 - part), acceleration=self.acceleration * (1 - part),
-                       torque=self.torque * (1 - part), speed=self.speed * (1 - part))  # fmt: skip
+                       torque=self.torque * (1 - part), speed=self.speed * (1 - part),
+                       power=self.power * (1 - part))  # fmt: skip
 
     def excess(self, quantities: Array) -> Array:
         """Return by how much quantities (m, names) exceed the limits, at most 0 inside, (m, names)."""

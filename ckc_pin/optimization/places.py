@@ -131,7 +131,7 @@ def _require_ways(names: Sequence[str], q: Array, places: Places) -> None:
 def _limits_jumps(spec: OptimizeSpec) -> str:
     """Return the key because of which torques do not jump at places; empty if they may."""
     keys = {"limits.torque_rate": spec.limits.torque_rate, "limits.jerk": spec.limits.jerk,
-            "minimize.jerk": spec.minimize.jerk}  # fmt: skip
+            "minimize.jerk": spec.minimize.jerk, "minimize.torque_rate": spec.minimize.torque_rate}  # fmt: skip
     return next((name for name, value in keys.items() if value), "")
 
 

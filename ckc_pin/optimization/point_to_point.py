@@ -35,6 +35,7 @@ MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
 FEW_ITERATIONS = 100  # of it, where other initial guesses may be better
 REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
+MAX_REPLAY_ERROR = 1e-2  # the same units: a plan with a larger one fails
 SAMPLES_PER_INTERVAL = 5
 UNBOUNDED_FACTOR = 1.1  # shorter durations, relative to the smallest that the optimizer may choose, are unbounded
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
@@ -109,7 +110,7 @@ def _plan_from(
         halves = misses and not friction.is_present and doublings < MAX_DOUBLINGS
         moves = friction.is_smoothed or (friction.is_present and misses)
         if not halves and not moves and not exceeded.intervals.any():
-            return plan
+            return _require_replayed(plan)
         doublings += halves
         if exceeded.intervals.any() or halves:
             base = mesh.divide(exceeded.intervals | halves)
@@ -117,7 +118,7 @@ def _plan_from(
         motion, ends = solution.motion(), solution.values.ends
         torque = interpolation(solution.values.torque_t, solution.values.torque)
     if not exceeded.intervals.any():
-        return plan
+        return _require_replayed(plan)
     raise NumericalError(
         f"optimize: budget: after {MAX_MESHES} meshes, {exceeded.name} still exceeds its limit by {exceeded.size:.1%} "
         "between the points of the mesh; give more intervals, or a wider limit"
@@ -169,6 +170,16 @@ def _require_durations(solution: Solution, guess: Guess, names: Sequence[str]) -
             f"optimize: unbounded: the motion from {names[k]} to {names[k + 1]} becomes arbitrarily short; give "
             "limits.rate, a weight of effort or another place"
         )
+
+
+def _require_replayed(plan: Plan) -> Plan:
+    """Raise NumericalError if a replay ends elsewhere. Dry friction has warnings instead, because joints may stick."""
+    if plan.replay.error > MAX_REPLAY_ERROR and not plan.mechanism.joints.friction.any():
+        raise NumericalError(
+            f"optimize: stuck: the replay of the plan misses its end by {plan.replay.error:.1e}: small errors grow "
+            f"during its {plan.t_end:.4g} s; give more intervals, limits.time or other limits"
+        )
+    return plan
 
 
 @dataclass(frozen=True, eq=False)

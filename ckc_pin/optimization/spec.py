@@ -156,6 +156,9 @@ class MinimizeSpec(FileStruct, frozen=True, kw_only=True):
     jerk : s⁵/rad²
         Of the integral of the squared jerks of the independent coordinates.
         ``jerk = 1e-6``
+    torque_rate : s/(N² m²)
+        Of the integral of the squared rates of the motor torques, which makes them smooth.
+        ``torque_rate = 1e-4``
     peak_torque : 1/(N m)
         Of the largest motor torque.
         ``peak_torque = 0.5``
@@ -169,6 +172,7 @@ class MinimizeSpec(FileStruct, frozen=True, kw_only=True):
     effort: Weight = 0.0
     energy: Weight = 0.0
     jerk: Weight = 0.0
+    torque_rate: Weight = 0.0
     peak_torque: Weight = 0.0
     tracking: Weight = 0.0
 

@@ -201,7 +201,7 @@ def test_paths_of_spatial_mechanisms_are_closed_and_regular(name: str) -> None:
             "from.q_dot: a motion along a path begins and ends at",
         ),
         ({"to": {"at": "assembled"}}, "to: the same configuration as `from`"),
-        ({"limits": {"torque": 2.0, "torque_rate": 10.0}}, "limits.torque_rate: not supported along a path"),
+        ({"minimize": {"tracking": 1.0}}, "minimize.tracking: not supported along a path"),
         ({"limits": {"torque": 2.0, "singularity": 1.0}}, "to: sigma_min(phi_z) is"),
     ],
 )
