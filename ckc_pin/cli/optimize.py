@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -26,22 +27,24 @@ __all__ = ["optimize"]
     epilog=options.format_examples(
         "ckc optimize swing.optimize.toml",
         "ckc optimize swing.optimize.toml --out plan",
+        "ckc optimize swing.optimize.toml --set limits.torque=3.0 --set link.plate.mass=0.2",
         "ckc optimize swing.optimize.toml --json",
     )
 )
 @click.argument(
     "file", metavar="FILE", type=options.PATH, help="A *.optimize.toml: a mechanism, a path or a target, and limits."
 )
+@options.overrides_of_file
 @options.out(help="Folder for open.scene.toml, closed.scene.toml, plan.csv, plan.json and the figure.")
 @options.as_json
-def optimize(file: Path, out: Path | None, as_json: bool) -> None:
+def optimize(file: Path, overrides: dict[str, Any], out: Path | None, as_json: bool) -> None:
     """Plan the motion that a file describes. The plan is replayed in the step loop."""
     from ckc_pin.optimization.optimize import optimize_file
 
     if out is not None:
         make_folder(out)
     with Spinner(f"optimize {file.name}"):
-        plan = optimize_file(file)
+        plan = optimize_file(file, overrides)
     files: list[Path] = []
     if out is not None:
         with ExitStack() as stack:
@@ -54,7 +57,7 @@ def optimize(file: Path, out: Path | None, as_json: bool) -> None:
         print_json(plan.to_dict(files))
     else:
         print_summary(plan.summary())
-        scenes = "open.scene.toml and closed.scene.toml"
+        scenes = "open.scene.toml and closed.scene.toml" if plan.can_be_tracked else "open.scene.toml"
         if plan.sections:
             scenes = f"{scenes} in part_1 to part_{len(plan.sections)}"
         print(format_destination(out, f"{scenes}, to run, and plan.csv, for the robot"))

@@ -131,9 +131,11 @@ def read_arguments(
     return make_spec(data, where), Sources(where, None, texts)
 
 
-def optimize_file(path: str | Path, progress: Callable[[float], None] | None = None) -> Plan:
-    """Plan the motion that a file describes; errors as of `optimize`."""
-    spec, sources = read_optimize(path)
+def optimize_file(
+    path: str | Path, overrides: Mapping[str, Any] | None = None, progress: Callable[[float], None] | None = None
+) -> Plan:
+    """Plan the motion that a file describes, with values replaced by dotted key; errors as of `optimize`."""
+    spec, sources = read_optimize(path, overrides)
     mechanism = load_beside(spec.mechanism, Path(path).parent, spec.parameters)
     return _optimize(mechanism, spec, sources, progress or (lambda fraction: None))
 

@@ -12,6 +12,7 @@ from ckc_pin.base.sources import Sources
 from ckc_pin.base.toml import FileStruct, convert, join_dotted_keys, read_text, read_toml
 from ckc_pin.control.spec import Limit, TorqueLimit
 from ckc_pin.mechanism.spec import Pair, Vector3
+from ckc_pin.scene.overrides import apply_overrides
 
 __all__ = [
     "KeepOutSpec",
@@ -27,6 +28,9 @@ __all__ = [
     "read_optimize",
 ]
 
+# Their keys are names that may contain dots.
+TABLES_BY_NAME = (("parameters",), *((place, key) for place in ("from", "to") for key in ("q", "q_dot")),
+                  ("limits", "q"))  # fmt: skip
 Weight = Annotated[float, msgspec.Meta(ge=0)]
 
 
@@ -319,8 +323,8 @@ class OptimizeSpec(FileStruct, frozen=True, kw_only=True):
     intervals: Annotated[int, msgspec.Meta(ge=4, le=20_000)] | None = None
 
 
-def read_optimize(path: str | Path) -> tuple[OptimizeSpec, Sources]:
-    """Read a plan's file.
+def read_optimize(path: str | Path, overrides: Mapping[str, Any] | None = None) -> tuple[OptimizeSpec, Sources]:
+    """Read a plan's file, with values replaced by dotted key.
 
     Raises
     ------
@@ -329,7 +333,7 @@ def read_optimize(path: str | Path) -> tuple[OptimizeSpec, Sources]:
     """
     path = Path(path)
     data = read_toml(read_text(path, "plan"), str(path))
-    join_dotted_keys(data, "parameters")
+    data = apply_overrides(data, overrides or {}, OptimizeSpec, TABLES_BY_NAME, "plan")
     for table in data["via"] if isinstance(data.get("via"), list) else ():
         join_dotted_keys(table, "parameters")
     sources = Sources(str(path), path.parent)

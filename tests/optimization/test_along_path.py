@@ -158,6 +158,19 @@ def test_command_writes_files_and_prints_json(tmp_path: Path) -> None:
     assert "plan.png" in result["files"]
 
 
+def test_set_and_unset_override_keys_of_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "slide.optimize.toml"
+    path = "[path]\nq = {theta_1 = [-1.434, -1.2], theta_3 = [-1.707, -1.6]}\n"
+    file.write_text(f'mechanism = "five_bar"\nintervals = 30\n{path}[limits]\ntorque = 2.0\nrate = 0.5\n')
+    changes = ["--set", "limits.torque=4.0", "--unset", "limits.rate", "--set", "link.link_2.mass=0.5"]
+    answer = ckc("optimize", str(file), *changes, "--json")
+    heavier = ckc_pin.load("five_bar", {"link.link_2.mass": 0.5})
+    places = {"q": {"theta_1": [-1.434, -1.2], "theta_3": [-1.707, -1.6]}}
+    assert answer.json["t_end"] == optimize(heavier, path=places, limits={"torque": 4.0}, intervals=30).t_end
+    wrong = ckc("optimize", str(file), "--set", "limits.toque=4.0")
+    assert (wrong.code, "unknown key 'toque'" in wrong.err) == (2, True)
+
+
 PATH = {"q": {"theta_1": [-1.4, -1.2], "theta_3": [-1.7, -1.6]}}
 
 
