@@ -9,7 +9,7 @@ import pickle
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 
 from ckc_pin import Mechanism, Run, load, simulate
-from ckc_pin.codegen import compiler
+from ckc_pin.codegen import compiler, library
 from ckc_pin.codegen.library import compile_terms
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR, FiveBar
 
@@ -199,6 +199,8 @@ def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names.rotate(2 * int(worker.removeprefix("gw") or 0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
+        # Terms that an earlier test has compiled without a cache are in a folder of the process, and not in this one.
+        patch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
         for name in names:
             with (folder / f"{name}.lock").open("w", encoding="utf-8") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)

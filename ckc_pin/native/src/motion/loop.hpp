@@ -66,7 +66,8 @@ class StepLoop {
   // Move the controller's desired q to x until `end`, see Controller. False if it has none that can be replaced.
   bool move_desired(double end, In x);
   // Advance to a time. `final`: the motion ends there. `pause`, `budget`: seconds until the next pause and until the
-  // end of the budget. A negative `pause`: before the first step and after each attempt of a step. A call with the same `until` after a pause continues as if there had been none.
+  // end of the budget. A negative `pause`: before the first step and after each attempt of a step. A call with the
+  // same `until` after a pause continues as if there had been none.
   //
   // If the motion does not end and neither control nor state have changed for several calls, the last step may end
   // beyond `until`. The present state is then inside that step, which is discarded at the next change.
