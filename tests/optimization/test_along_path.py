@@ -162,8 +162,8 @@ def test_set_and_unset_override_keys_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "slide.optimize.toml"
     path = "[path]\nq = {theta_1 = [-1.434, -1.2], theta_3 = [-1.707, -1.6]}\n"
     file.write_text(f'mechanism = "five_bar"\nintervals = 30\n{path}[limits]\ntorque = 2.0\nrate = 0.5\n')
-    changes = ["--set", "limits.torque=4.0", "--unset", "limits.rate", "--set", "link.link_2.mass=0.5"]
-    answer = ckc("optimize", str(file), *changes, "--json")
+    options = ["--set", "limits.torque=4.0", "--unset", "limits.rate", "--set", "link.link_2.mass=0.5"]
+    answer = ckc("optimize", str(file), *options, "--json")
     heavier = ckc_pin.load("five_bar", {"link.link_2.mass": 0.5})
     places = {"q": {"theta_1": [-1.434, -1.2], "theta_3": [-1.707, -1.6]}}
     assert answer.json["t_end"] == optimize(heavier, path=places, limits={"torque": 4.0}, intervals=30).t_end
