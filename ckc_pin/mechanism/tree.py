@@ -85,6 +85,8 @@ class Tree:
         Place in q and in v' of each free root.
     free_coordinates : set of str
         Names of the coordinates of free roots.
+    is_angle : (n,) bool array
+        Angles of joints with one freedom.
     in_metres : (n,) bool array
         Whether each coordinate is a length; the others are angles.
     step_scale : (n,) array
@@ -116,6 +118,7 @@ class Tree:
         self.free_coordinates = {self.coordinates[v + k] for _, v in self.free_roots for k in range(6)}
         self.in_metres = np.array([_in_metres(model, label) for label in self.coordinates], dtype=bool)
         self.size = size
+        self.is_angle = ~self.in_metres & [name not in self.free_coordinates for name in self.coordinates]
         self.step_scale = np.where(self.in_metres, size, 1.0)
         self._q_scale = np.ones(self.nq)
         self._q_scale[self.q_index] = self.step_scale

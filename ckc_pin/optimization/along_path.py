@@ -80,7 +80,6 @@ def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> 
     InputError
         The loops do not let the mechanism follow the path.
     """
-    mechanism = dynamics.mechanism
     q, q_s, q_ss = path.q(s)
     q_tree = follow_places(dynamics, q, s, path.start)
     zero, no_torque = np.zeros_like(q), np.zeros((len(s), dynamics.motors))
@@ -88,8 +87,7 @@ def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> 
     forth = dynamics.instants(q_tree, q_s, q_ss, no_torque)
     back = dynamics.instants(q_tree, -q_s, q_ss, no_torque)
     pushed = dynamics.instants(q_tree, zero, q_s, no_torque)
-    rho = dynamics.rho(q_tree)
-    friction = friction_force(mechanism, forth.v_tree)
+    friction = friction_force(dynamics.mechanism, forth.v_tree)
     return PathDynamics(
         s=s,
         q_tree=q_tree,
@@ -98,8 +96,8 @@ def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> 
         inertia=pushed.force - at_rest.force,
         centrifugal=(forth.force + back.force) / 2 - at_rest.force,
         damping=(forth.force - back.force) / 2,
-        static=at_rest.force - np.einsum("mnd,mn->md", rho, friction),
-        transmission=np.einsum("mnd,kn->mdk", rho, mechanism.motors.transmission),
+        static=at_rest.force - np.einsum("mnd,mn->md", dynamics.rho(q_tree), friction),
+        transmission=dynamics.transmission(q_tree),
     )
 
 
@@ -259,13 +257,14 @@ def _reachable_b(path: PathDynamics, alpha: Array, beta: Array, gamma: Array) ->
 def minimum_norm_within(transmission: Array, force: Array, limit: Array) -> Array:
     """Return the torques (m, motors) of smallest norm within limits (2, motors) that produce forces (m, d).
 
-    The torque that exceeds its limits most is set to the limit, and the others are distributed again. Where that fails,
-    bounded least squares decide.
+    Torques of motors that are not redundant are clipped at their limits. Of redundant motors, the torque that exceeds
+    its limits most is set to the limit, and the others are distributed again. Where that fails, bounded least squares
+    decide.
     """
     tau = np.einsum("mkd,md->mk", np.linalg.pinv(transmission), force)
     motors, at = transmission.shape[2], np.arange(len(force))
     if motors <= transmission.shape[1]:
-        return tau
+        return np.clip(tau, *limit)
     fixed = np.zeros(tau.shape, dtype=bool)
     for _ in range(motors):
         beyond = np.where(fixed, -1.0, np.maximum(limit[0] - tau, tau - limit[1]))

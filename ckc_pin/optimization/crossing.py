@@ -80,6 +80,8 @@ def find_crossings(
 ) -> tuple[Crossing, ...]:  # fmt: skip
     """Return where a motion in other coordinates passes singular configurations of a mechanism.
 
+    There are none if the coordinates are the mechanism's independent ones.
+
     Parameters
     ----------
     mechanism : Mechanism
@@ -92,6 +94,8 @@ def find_crossings(
     torque : callable
         Motor torques (k, motors) at times (k,).
     """
+    if dynamics.mechanism is mechanism:  # Its loops are followed without a change of the sign of det phi_z.
+        return ()
     z = mechanism.partition.z
 
     def determinant(time: float, sample: int) -> float:
@@ -113,8 +117,7 @@ def _unbalanced(
     q, v, a = motion(np.array([time]))
     q_tree = dynamics.follow(start, q)
     assert q_tree is not None
-    forces = np.einsum("mnd,kn->mdk", dynamics.rho(q_tree), dynamics.mechanism.motors.transmission)[0]
-    direction = np.linalg.svd(forces)[0][:, -1]
+    direction = np.linalg.svd(dynamics.transmission(q_tree)[0])[0][:, -1]
     needed = dynamics.instants(q_tree, v, a, np.zeros((1, dynamics.motors))).force[0]
     missing = dynamics.instants(q_tree, v, a, torque(np.array([time]))).force[0]
     return float(np.abs(direction @ missing) / np.linalg.norm(needed))

@@ -1,4 +1,4 @@
-"""Ends of planned motions: their configurations on a branch, and what a plan requires of them."""
+"""States at the ends of planned motions: configurations on a branch, with rates, and their checks against limits."""
 
 from __future__ import annotations
 
@@ -113,8 +113,7 @@ def _unwind(at: Kinematics, reference: Kinematics) -> Kinematics:
     Couplings of joints may forbid this. The configuration is returned as it is then.
     """
     tree = at.tree
-    angles = [k for k in at.partition.z if not tree.in_metres[k] and tree.coordinates[k] not in tree.free_coordinates]
-    turning = tree.q_index[angles]
+    turning = tree.q_index[at.partition.z[tree.is_angle[at.partition.z]]]
     q_tree = np.array(at.q_tree)
     q_tree[turning] -= 2 * np.pi * np.round((q_tree - reference.q_tree)[turning] / (2 * np.pi))
     unwound = Kinematics(tree, at.closure, at.partition, q_tree)
@@ -131,13 +130,11 @@ def in_coordinates(planned: Mechanism, state: EndState) -> EndState:
 
 def refuse_with_crossings(spec: OptimizeSpec) -> None:
     """Refuse what refers to the independent coordinates or to singular configurations."""
-    for table, names in ((spec.limits, ("singularity", "jerk")), (spec.minimize, ("jerk", "tracking"))):
-        for name in names:
-            if getattr(table, name):
-                key = f"{'limits' if table is spec.limits else 'minimize'}.{name}"
-                raise InputError(f"optimize: {key}: not supported with cross_singularities; remove one of them")
-    for key in ("via", "periodic"):
-        if getattr(spec, key):
+    keys = {"limits.singularity": spec.limits.singularity, "limits.jerk": spec.limits.jerk,
+            "minimize.jerk": spec.minimize.jerk, "minimize.tracking": spec.minimize.tracking, "via": spec.via,
+            "periodic": spec.periodic}  # fmt: skip
+    for key, value in keys.items():
+        if value:
             raise InputError(f"optimize: {key}: not supported with cross_singularities; remove one of them")
 
 

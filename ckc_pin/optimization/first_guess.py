@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import PathDynamics, find_fastest, minimum_norm_within, path_dynamics
@@ -17,7 +18,7 @@ from ckc_pin.optimization.collocation import Collocation
 from ckc_pin.optimization.crossing import find_routes
 from ckc_pin.optimization.end_states import EndState, in_coordinates
 from ckc_pin.optimization.free_path import find_path, is_separated, search_path
-from ckc_pin.optimization.guess_motions import Joined, Slowed, SmoothMotion, UniformMotion, scale_durations
+from ckc_pin.optimization.guess_motions import Joined, Slowed, SmoothMotion, scale_durations
 from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Places, Solution, times
@@ -28,7 +29,7 @@ from ckc_pin.optimization.reduced import ReducedDynamics
 from ckc_pin.optimization.route import Route
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec
 
-__all__ = ["FirstGuess", "Way", "find_guesses", "guess_motion", "interpolation", "sample_motion"]
+__all__ = ["FirstGuess", "Way", "find_guesses", "guess_between", "interpolation", "sample_motion"]
 
 GUESS_PLACES = 100  # of the path of the initial guess
 SLOWER = 1.05  # initial guess's duration, relative to the fastest one along its path
@@ -64,7 +65,7 @@ class Way(Immutable):
 
 @dataclass(frozen=True, eq=False)
 class FirstGuess(Immutable):
-    """An initial guess: a motion with the times of its places, and its torques or None."""
+    """An initial guess of the optimizer: a motion, the times of its places, s, and its torques if there are any."""
 
     way: Way
     motion: CoordinateMotion
@@ -80,7 +81,7 @@ def find_guesses(way: Way, spec: OptimizeSpec, limits: MotionLimits) -> Iterator
     if not spec.cross_singularities:
         turns = way.route.places.turns is not None and bool(way.route.places.turns.any())
         t = way.route.places.t
-        motion = guess_route(way.route.members, spec.minimize, limits, way.states, t, turns=turns)
+        motion = _guess_route(way.route.members, spec.minimize, limits, way.states, t, turns=turns)
         ends = motion.corners
         yield FirstGuess(way, motion, ends)
         duration = _duration(spec.minimize, limits, RETRY_SLOWER * float(ends[-1]))
@@ -97,8 +98,8 @@ def find_guesses(way: Way, spec: OptimizeSpec, limits: MotionLimits) -> Iterator
         yield from (guess for guess in row if guess is not None)
 
 
-def interpolation(times: Array, values: Array) -> Callable[[Array], Array]:
-    """Return the function of times (m,) that connects rows (k, columns) by straight lines."""
+def interpolation(times: Array, values: Array) -> Torques:
+    """Return the function of times (m,) that interpolates the rows (k, columns) of a table linearly."""
     return lambda t: np.array([np.interp(t, times, x) for x in values.T]).T.reshape(len(t), -1)
 
 
@@ -110,7 +111,7 @@ def _guess_along(
     The optimizer often succeeds from a motion of minimum effort with wider limits of torques.
     """
     start, end = way.states
-    motion = guess_motion(way.dynamics, path, minimize, limits, start, end)
+    motion = _guess_motion_along(way.dynamics, path, minimize, limits, start, end)
     is_first = isinstance(motion.motion, PathMotion)
     fastest = FirstGuess(way, motion, motion.corners)
     yield fastest if is_first else None
@@ -138,7 +139,7 @@ def _minimize_effort(way: Way, path: CoordinatePath, limits: MotionLimits, inter
     return problem.solve(guess, optimizer)[0]
 
 
-def guess_motion(
+def _guess_motion_along(
     dynamics: ReducedDynamics, path: CoordinatePath, minimize: MinimizeSpec, limits: MotionLimits, start: EndState,
     end: EndState,
 ) -> Slowed:  # fmt: skip
@@ -168,15 +169,15 @@ def _typical_duration(along: PathDynamics, limits: MotionLimits, reduce: Callabl
     return max(float(np.sqrt(force / available)), 1e-2)
 
 
-def _guess_between(
+def guess_between(
     dynamics: ReducedDynamics, minimize: MinimizeSpec, limits: MotionLimits, start: EndState, end: EndState
 ) -> Slowed:
     """Return a motion between the ends along a path that the loops can follow."""
     path = search_path(dynamics.mechanism, limits, start.at.q_tree, end.at.q_tree)
-    return guess_motion(dynamics, path, minimize, limits, start, end)
+    return _guess_motion_along(dynamics, path, minimize, limits, start, end)
 
 
-def guess_route(
+def _guess_route(
     members: Sequence[ReducedDynamics], minimize: MinimizeSpec, limits: MotionLimits, states: Sequence[EndState],
     t: Array, *, turns: bool = False,
 ) -> CoordinateMotion:  # fmt: skip
@@ -192,13 +193,14 @@ def guess_route(
         The motion repeats after whole turns, so that it need not rest at its ends.
     """
     if len(states) == 2:
-        motion = _guess_between(members[0], minimize, limits, *states)
+        motion = guess_between(members[0], minimize, limits, *states)
         if not turns:
             return motion
         way = states[1].q - states[0].q
         fastest = float(np.max(np.abs(way) / limits.rate[members[0].q_at])) or float(motion.corners[-1])
-        return UniformMotion(states[0].q, states[1].q, _duration(minimize, limits, UNEVEN * fastest))
-    legs = [_guess_between(dynamics, MinimizeSpec(time=1.0), limits, *pair)
+        ends = np.array([0.0, _duration(minimize, limits, UNEVEN * fastest)])
+        return PiecewisePolynomial(ends, np.array([[way / ends[1]], [states[0].q]]), corners=ends)
+    legs = [guess_between(dynamics, MinimizeSpec(time=1.0), limits, *pair)
             for dynamics, pair in zip(members, pairwise(states), strict=True)]  # fmt: skip
     durations, t = np.array([leg.corners[-1] for leg in legs]), np.array(t)
     if np.isnan(t[-1]) and (not minimize.time or scale_durations(durations, t).sum() > limits.time):
@@ -215,7 +217,7 @@ def _duration(minimize: MinimizeSpec, limits: MotionLimits, fastest: float) -> f
 
 def sample_motion(
     dynamics: ReducedDynamics, limits: MotionLimits, motion: CoordinateMotion, mesh: Mesh, start: Array,
-    torque: Callable[[Array], Array] | None, ends: Array | None = None, members: Sequence[ReducedDynamics] = (),
+    torque: Torques | None, ends: Array | None = None, members: Sequence[ReducedDynamics] = (),
 ) -> Guess:  # fmt: skip
     """Return a motion on a mesh as an initial guess, with its torques or those of inverse dynamics.
 
@@ -237,8 +239,7 @@ def sample_motion(
         _, rates, accelerations = motion(torque_t)
         of_phases = PhaseDynamics(members or [dynamics] * mesh.phases, mesh.phase_of_knots)
         at = of_phases.instants(knots, rates, accelerations, np.zeros((len(knots), dynamics.motors)))
-        transmission = np.einsum("mnd,kn->mdk", dynamics.rho(knots), dynamics.mechanism.motors.transmission)
-        tau = np.clip(minimum_norm_within(transmission, at.force, limits.torque), *limits.torque)
+        tau = minimum_norm_within(dynamics.transmission(knots), at.force, limits.torque)
     else:
         tau = torque(torque_t)
     accelerations = a[~is_knot].reshape(len(mesh.knots) - 1, DEGREE, -1)

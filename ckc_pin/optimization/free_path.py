@@ -19,7 +19,7 @@ from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath, round_corners
 
-__all__ = ["MAX_ATTEMPTS", "FreeSpace", "find_path", "is_separated", "search_path", "unlimited_angles"]
+__all__ = ["MAX_ATTEMPTS", "FreeSpace", "find_path", "is_separated", "search_path"]
 
 MAX_ATTEMPTS = 2000  # random configurations that the trees grow towards
 CLEARANCE = 0.3  # of the smaller sigma_min of the ends: least one of a path that is preferred
@@ -64,7 +64,8 @@ class FreeSpace:
         self.task = Task(extended, extended.joints)
         self.scale = mechanism.tree.step_scale[mechanism.partition.q]
         self._limited = np.flatnonzero(np.isfinite(limits.q).any(axis=0))
-        self._turning = mechanism.tree.q_index[unlimited_angles(mechanism, limits, mechanism.partition.z)]
+        turns = mechanism.tree.is_angle & ~np.isfinite(limits.q).any(axis=0)
+        self._turning = mechanism.tree.q_index[mechanism.partition.z[turns[mechanism.partition.z]]]
         self._min_sigma = min_sigma
         if limits.singularity:
             self._min_sigma = max(min_sigma, limits.singularity * float(self.sigma_min(self.node(start))[0]))
@@ -149,13 +150,6 @@ class FreeSpace:
             return np.zeros((0, len(nodes.q_tree), 3))
         places = [self.mechanism.point_positions(x) for x in nodes.q_tree]
         return np.array([[place[name] for place in places] for name in names])
-
-
-def unlimited_angles(mechanism: Mechanism, limits: MotionLimits, at: IntArray) -> IntArray:
-    """Return those of some coordinates (places) that are angles of joints without limits."""
-    tree = mechanism.tree
-    return np.array([k for k in at.tolist() if not tree.in_metres[k] and not np.isfinite(limits.q[:, k]).any()
-                     and mechanism.coordinates[k] not in tree.free_coordinates], dtype=np.intp)  # fmt: skip
 
 
 def search_path(mechanism: Mechanism, limits: MotionLimits, start: Array, end: Array) -> CoordinatePath:

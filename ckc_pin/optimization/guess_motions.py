@@ -11,22 +11,28 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.control.piecewise import PiecewisePolynomial
 from ckc_pin.optimization.plan import CoordinateMotion
 
-__all__ = ["Joined", "Slowed", "SmoothMotion", "UniformMotion", "scale_durations"]
+__all__ = ["Joined", "Shifted", "Slowed", "SmoothMotion", "scale_durations"]
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothMotion:
-    """Motion along a path with a cubic polynomial of time, plus cubics that give the rates at the ends."""
+class _TimedMotion:
+    """A motion that begins at 0 and takes a duration, s."""
 
-    path: PiecewisePolynomial
-    start: Array
-    end: Array
     duration: float
 
     @property
     def corners(self) -> Array:
         """Both ends, s."""
         return np.array([0.0, self.duration])
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMotion(_TimedMotion):
+    """Motion along a path with a cubic polynomial of time, plus cubics that give the rates at the ends."""
+
+    path: PiecewisePolynomial
+    start: Array
+    end: Array
+    duration: float
 
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
@@ -42,16 +48,11 @@ class SmoothMotion:
 
 
 @dataclass(frozen=True, eq=False)
-class Slowed:
+class Slowed(_TimedMotion):
     """A motion with another duration."""
 
     motion: CoordinateMotion
     duration: float
-
-    @property
-    def corners(self) -> Array:
-        """Both ends, s."""
-        return np.array([0.0, self.duration])
 
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
@@ -61,22 +62,19 @@ class Slowed:
 
 
 @dataclass(frozen=True, eq=False)
-class UniformMotion:
-    """Motion along a straight line at constant rates."""
+class Shifted(_TimedMotion):
+    """A motion from a later time on, at rest after its end."""
 
-    start: Array
-    end: Array
+    motion: PiecewisePolynomial
+    passed: float
     duration: float
-
-    @property
-    def corners(self) -> Array:
-        """Both ends, s."""
-        return np.array([0.0, self.duration])
 
     def __call__(self, t: Array) -> tuple[Array, Array, Array]:
         """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
-        rates = (self.end - self.start) / self.duration
-        return self.start + np.outer(t, rates), np.tile(rates, (len(t), 1)), np.zeros((len(t), len(rates)))
+        end = self.motion.breaks[-1]
+        q, v, a = self.motion(np.minimum(t + self.passed, end))
+        moves = (t + self.passed <= end)[:, None]
+        return q, v * moves, a * moves
 
 
 @dataclass(frozen=True, eq=False)

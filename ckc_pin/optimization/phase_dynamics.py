@@ -36,11 +36,11 @@ class PhaseDynamics:
             self._parts.append((members[k], slice(begin, end)))
 
     def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
-        """Return a motion, as `ReducedDynamics.instants`."""
+        """Return `ReducedDynamics.instants` of all phases."""
         return _joined([x.instants(q_tree[at], v[at], a[at], tau[at]) for x, at in self._parts])
 
     def differentiate(self, at: MotionInstants) -> Derivatives:
-        """Return derivatives, as `ReducedDynamics.differentiate`."""
+        """Return `ReducedDynamics.differentiate` of all phases."""
         if len(self._parts) == 1:
             return self._parts[0][0].differentiate(at)
         return _joined([x.differentiate(_selected(at, rows)) for x, rows in self._parts])
@@ -48,7 +48,7 @@ class PhaseDynamics:
     def hessian(
         self, at: MotionInstants, by_x: Derivatives, weights: Array, state_weights: Array | None = None
     ) -> Array:
-        """Return second derivatives, as `ReducedDynamics.hessian`."""
+        """Return `ReducedDynamics.hessian` of all phases."""
         if len(self._parts) == 1:
             return self._parts[0][0].hessian(at, by_x, weights, state_weights)
         return np.concatenate([

@@ -253,7 +253,7 @@ def _read_turns(mechanism: Mechanism, periodic: PeriodicSpec) -> Array:
 
 
 def _require_motion(spec: OptimizeSpec, turns: Array) -> None:
-    """Refuse a periodic problem that rest solves."""
+    """Refuse a periodic problem whose solution is a mechanism at rest."""
     places = (spec.start is not None) + len(spec.via)
     rates = [x.q_dot for x in spec.via] + ([] if spec.start is None else [spec.start.q_dot])
     moves = any(any(x.values()) for x in rates)

@@ -76,7 +76,7 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
 
 
 def _is_fastest(spec: OptimizeSpec, limits: MotionLimits) -> bool:
-    """Whether the fastest motion within limits of torques, rates and accelerations is asked for."""
+    """Whether the cost is the duration alone, within limits that the sweeps of `find_fastest` keep."""
     weights = [name for name in spec.minimize.__struct_fields__ if getattr(spec.minimize, name)]
     others = np.concatenate([limits.torque_rate, limits.power, limits.jerk])
     return weights == ["time"] and not np.isfinite(others).any()
@@ -188,18 +188,15 @@ def _instants(
 
     The force (m,) is relative to the largest one.
     """
-    mechanism = dynamics.mechanism
     _, v, a = motion(t)
     # The loops are followed through all corners, because the path may bend between the instants.
     places = np.union1d(t, motion.corners)
     q_tree = follow_places(dynamics, motion(places)[0], places, motion.path.start)[np.searchsorted(places, t)]
     at = dynamics.instants(q_tree, v, a, np.zeros((len(t), dynamics.motors)))
-    rho = dynamics.rho(q_tree)
-    friction = friction_force(mechanism, at.v_tree)
-    force = at.force - np.einsum("mnd,mn->md", rho, friction)
-    transmission = np.einsum("mnd,kn->mdk", rho, mechanism.motors.transmission)
+    friction = friction_force(dynamics.mechanism, at.v_tree)
+    force = at.force - np.einsum("mnd,mn->md", dynamics.rho(q_tree), friction)
+    transmission = dynamics.transmission(q_tree)
     tau = minimum_norm_within(transmission, force, limits.torque)
-    tau = np.clip(tau, *limits.torque)
     missing = np.abs(np.einsum("mdk,mk->md", transmission, tau) - force).max(axis=1) / np.abs(force).max()
     return dynamics.instants(q_tree, v, a, tau), missing
 

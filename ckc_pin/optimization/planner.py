@@ -19,8 +19,8 @@ from ckc_pin.kinematics.loading import as_mechanism
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.collocation import Collocation
 from ckc_pin.optimization.end_states import refuse_unsupported, resolve_state
-from ckc_pin.optimization.first_guess import guess_motion, interpolation, sample_motion
-from ckc_pin.optimization.free_path import search_path
+from ckc_pin.optimization.first_guess import guess_between, interpolation, sample_motion
+from ckc_pin.optimization.guess_motions import Shifted
 from ckc_pin.optimization.ipopt import Ipopt, Optimum
 from ckc_pin.optimization.limits import make_limits
 from ckc_pin.optimization.mesh_motion import Guess, Mesh, Places, Solution
@@ -212,7 +212,8 @@ class Planner:
                 Ipopt(self._problem, iterations=MAX_ITERATIONS, tolerance=TOLERANCE, warm=warm)
                 for warm in (False, True)
             )
-        self._problem.set_places(places, desired)
+        else:
+            self._problem.set_places(places, desired)
         if self._last is not None:
             solution, optimum = self._problem.solve(guess, self._warm, self._last[1])
             if solution.is_optimum:
@@ -239,27 +240,5 @@ class Planner:
             q=dict(zip(names, q.tolist(), strict=True)), q_dot=dict(zip(names, rates.tolist(), strict=True))
         )
         start = resolve_state(self.mechanism, spec, self.mechanism.assembled, "state")
-        path = search_path(self.mechanism, limits, start.at.q_tree, self._end.at.q_tree)
-        motion = guess_motion(dynamics, path, self._minimize, limits, start, self._end)
+        motion = guess_between(dynamics, self._minimize, limits, start, self._end)
         return sample_motion(dynamics, limits, motion, mesh, self._q_tree, None)
-
-
-@dataclass(frozen=True, eq=False)
-class Shifted:
-    """A motion from a later time on, at rest after its end."""
-
-    motion: PiecewisePolynomial
-    passed: float
-    duration: float
-
-    @property
-    def corners(self) -> Array:
-        """Both ends, s."""
-        return np.array([0.0, self.duration])
-
-    def __call__(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return values, rates and accelerations, (m, d) each, at times t (m,)."""
-        end = self.motion.breaks[-1]
-        q, v, a = self.motion(np.minimum(t + self.passed, end))
-        moves = (t + self.passed <= end)[:, None]
-        return q, v * moves, a * moves

@@ -105,7 +105,6 @@ class ReducedDynamics:
         self.q_in_tree = tree.q_index[self.q_at]
         self.z_in_tree = np.setdiff1d(np.arange(tree.nq), self.q_in_tree)
         self._functions = MotionFunctions(mechanism)
-
         self.state_symbols = tuple(
             casadi.SX.sym(name, size)
             for name, size in (("q", tree.nq), ("v", self.n), ("v_dot", self.n), ("tau", self.motors))
@@ -209,6 +208,10 @@ class ReducedDynamics:
         """Return rho of eq. 5 at closed configurations, (m, n, d)."""
         J = self.jacobians(q_tree)
         return self._rho(J, _inverse(J[:, :, self.z_at]))
+
+    def transmission(self, q_tree: Array) -> Array:
+        """Return rho^T G^T at closed configurations, (m, d, motors): forces of eq. 6 by motor torques."""
+        return np.einsum("mnd,kn->mdk", self.rho(q_tree), self.mechanism.motors.transmission)
 
     def _rho(self, J: Array, inverse: Array) -> Array:
         rho = np.zeros((len(J), self.n, self.d))

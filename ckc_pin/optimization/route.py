@@ -23,7 +23,7 @@ FORCE_TOLERANCE = 1e-8  # relative to the largest force: what torques within lim
 
 @dataclass(frozen=True)
 class Stay:
-    """Time at rest at a place, s, with the place's name."""
+    """A rest at a place: the name of the place, and how long the rest lasts, s."""
 
     name: str
     duration: float
@@ -132,10 +132,10 @@ class Route(Immutable):
 
 def _hold(dynamics: ReducedDynamics, limits: MotionLimits, q_tree: Array, name: str) -> Array:
     """Return the torques of smallest norm that hold a mechanism at rest (InputError)."""
-    mechanism, still = dynamics.mechanism, np.zeros((1, dynamics.d))
+    still = np.zeros((1, dynamics.d))
     at = dynamics.instants(q_tree[None], still, still, np.zeros((1, dynamics.motors)))
-    transmission = np.einsum("mnd,kn->mdk", dynamics.rho(q_tree[None]), mechanism.motors.transmission)
-    tau = np.clip(minimum_norm_within(transmission, at.force, limits.torque), *limits.torque)
+    transmission = dynamics.transmission(q_tree[None])
+    tau = minimum_norm_within(transmission, at.force, limits.torque)
     missing = np.abs(np.einsum("mdk,mk->md", transmission, tau) - at.force).max()
     if missing > FORCE_TOLERANCE * max(float(np.abs(at.force).max()), 1.0):
         raise InputError(

@@ -84,7 +84,11 @@ def optimize_profile(
 
 
 class _Problem:
-    """Variables, cost and constraints of a profile: b inside, u and motor torques at all points, and two for maxima."""
+    """The nonlinear program of a profile.
+
+    Variables are b between both ends, u and the motor torques at all points, the power that each motor draws at all
+    points if energy has a weight, and the largest torque if it has one.
+    """
 
     def __init__(
         self, dynamics: ReducedDynamics, path: PathDynamics, limits: MotionLimits, minimize: MinimizeSpec,
@@ -92,82 +96,105 @@ class _Problem:
     ) -> None:  # fmt: skip
         import casadi as cs
 
+        self.path, self.limits, self.dynamics = path, limits, dynamics
         self.rows: list[Any] = []
         self.bounds: list[tuple[float, float]] = []
-        self.path, self.limits, self.dynamics = path, limits, dynamics
-        points, motors = len(path.s), dynamics.motors
-        step, largest = np.diff(path.s), float(fastest.b.max())
-        start_b = fastest.b / SLOWER**2
-        start_u = np.gradient(start_b, path.s) / 2
-        force = path.force(start_u, start_b)
-        start_tau = np.clip(minimum_norm_within(path.transmission, force, limits.torque), *limits.torque)
-        unit = np.maximum(np.abs(start_tau).max(axis=0), 1e-9 * max(float(np.abs(force).max()), 1e-9))
-        w_b, w_u = cs.SX.sym("b", points - 2), cs.SX.sym("u", points)
-        w_tau, w_power = cs.SX.sym("tau", motors * points), cs.SX.sym("power", motors * points * bool(minimize.energy))
-        peak = cs.SX.sym("peak", bool(minimize.peak_torque))
-        self.w = cs.vertcat(w_b, w_u, w_tau, w_power, peak)
-        self.b, self.u = largest * cs.vertcat(0, w_b, 0), largest * w_u
-        rate = cs.sqrt(self.b[1:-1])
-        s_dot = cs.vertcat(0, rate, 0)
-        self.duration = 2 * cs.DM(step) / (s_dot[1:] + s_dot[:-1])
-        tau = [unit[k] * w_tau[k * points : (k + 1) * points] for k in range(motors)]
-        size = float(np.abs(force).max())
-        self._require((self.b[1:] - self.b[:-1] - cs.DM(step) * (self.u[1:] + self.u[:-1])) / largest, 0.0, 0.0)
-        for i in range(dynamics.d):
-            needed = (cs.DM(path.inertia[:, i]) * self.u + cs.DM(path.centrifugal[:, i]) * self.b
-                      + cs.DM(path.damping[:, i]) * s_dot + cs.DM(path.static[:, i]))  # fmt: skip
-            produced = sum(cs.DM(path.transmission[:, i, k]) * tau[k] for k in range(motors))
-            self._require((needed - produced) / size, 0.0, 0.0)
-        q_at = dynamics.q_at.tolist()
-        accelerations = {k: cs.DM(path.v_tree[:, k]) * self.u + cs.DM(path.a_tree[:, k]) * self.b
-                         for k in range(dynamics.n) if k in q_at or np.isfinite(limits.acceleration[k])}  # fmt: skip
-        for k, acceleration in accelerations.items():
-            self._limit(acceleration, limits.acceleration[k])
-        shafts = path.v_tree @ dynamics.mechanism.motors.transmission.T
-        power = [tau[k] * cs.DM(shafts[:, k]) * s_dot for k in range(motors)]
-        for k in range(motors):
-            self._limit(power[k], limits.power[k])
-            self._limit_rate(tau[k], limits.torque_rate[k])
-        for i, k in enumerate(q_at):
-            self._limit_rate(accelerations[k], limits.jerk[i])
         self.parts: dict[str, Any] = {}
-        if minimize.time:
-            self.parts["time"] = cs.sum1(self.duration)
-        if minimize.effort:
-            self.parts["effort"] = sum(
-                cs.dot(self.duration, x[1:] ** 2 + x[1:] * x[:-1] + x[:-1] ** 2) / 3 for x in tau
-            )
-        if minimize.torque_rate:
-            self.parts["torque_rate"] = sum(cs.sum1((x[1:] - x[:-1]) ** 2 / self.duration) for x in tau)
-        if minimize.jerk:
-            self.parts["jerk"] = sum(
-                cs.sum1((accelerations[k][1:] - accelerations[k][:-1]) ** 2 / self.duration) for k in q_at
-            )
-        start_power = np.maximum(start_tau * shafts * np.sqrt(start_b)[:, None], 0.0)
-        power_unit = max(float(start_power.max(initial=0.0)), 1e-9)
-        if minimize.energy:
-            drawn = [power_unit * w_power[k * points : (k + 1) * points] for k in range(motors)]
-            for one, other in zip(drawn, power, strict=True):
-                self._require((one - other) / power_unit, 0.0, np.inf)
-            self.parts["energy"] = sum(cs.dot(self.duration, x[1:] + x[:-1]) / 2 for x in drawn)
-        if minimize.peak_torque:
-            top = float(unit.max())
-            for x in tau:
-                self._require((top * peak - x) / top, 0.0, np.inf)
-                self._require((top * peak + x) / top, 0.0, np.inf)
-            self.parts["peak_torque"] = top * peak
+        points, motors = len(path.s), dynamics.motors
+        self.shafts = path.v_tree @ dynamics.mechanism.motors.transmission.T  # rates for s_dot = 1
+        b, largest = fastest.b / SLOWER**2, float(fastest.b.max())
+        u = np.gradient(b, path.s) / 2
+        force = path.force(u, b)
+        torque = minimum_norm_within(path.transmission, force, limits.torque)
+        power = np.maximum(torque * self.shafts * np.sqrt(b)[:, None], 0.0)
+        self.size = float(np.abs(force).max())
+        self.unit = np.maximum(np.abs(torque).max(axis=0), 1e-9 * max(self.size, 1e-9))
+        self.power_unit = max(float(power.max(initial=0.0)), 1e-9)
+        blocks = {
+            "b": (b[1:-1] / largest, MIN_B, largest_path_rates(dynamics, path, limits)[1:-1] / largest),
+            "u": (u / largest, -np.inf, np.inf),
+            "tau": ((torque / self.unit).T.ravel(), *(np.repeat(x / self.unit, points) for x in limits.torque)),
+            "power": ((power / self.power_unit).T.ravel() if minimize.energy else np.zeros(0), 0.0, np.inf),
+            "peak": (np.ones(1 if minimize.peak_torque else 0), 0.0, np.inf),
+        }
+        guesses, lower, upper = zip(*blocks.values(), strict=True)
+        self.guess = np.concatenate(guesses)
+        self.lower, self.upper = (
+            np.concatenate([np.broadcast_to(x, len(y)) for x, y in zip(bound, guesses, strict=True)])
+            for bound in (lower, upper)
+        )
+        w = {name: cs.SX.sym(name, len(guess)) for name, guess in zip(blocks, guesses, strict=True)}
+        self.w = cs.vertcat(*w.values())
+        self.b, self.u = largest * cs.vertcat(0, w["b"], 0), largest * w["u"]
+        self.s_dot = cs.vertcat(0, cs.sqrt(self.b[1:-1]), 0)  # sqrt has no derivative at 0
+        self.duration = 2 * cs.DM(np.diff(path.s)) / (self.s_dot[1:] + self.s_dot[:-1])
+        self.tau = [self.unit[k] * w["tau"][k * points : (k + 1) * points] for k in range(motors)]
+        self.power = [self.tau[k] * cs.DM(self.shafts[:, k]) * self.s_dot for k in range(motors)]
+        self.a = {k: cs.DM(path.v_tree[:, k]) * self.u + cs.DM(path.a_tree[:, k]) * self.b
+                  for k in range(dynamics.n) if k in dynamics.q_at or np.isfinite(limits.acceleration[k])}  # fmt: skip
+        drawn = cs.reshape(w["power"], -1, motors) if minimize.energy else None
+        self._add_equations(largest)
+        self._add_limits()
+        self._add_parts(minimize, drawn, w["peak"])
+
+    def _add_equations(self, largest: float) -> None:
+        """Require that b belongs to u, and eq. 6 at all points."""
+        import casadi as cs
+
+        path = self.path
+        gain = cs.DM(np.diff(path.s)) * (self.u[1:] + self.u[:-1])
+        self._require((self.b[1:] - self.b[:-1] - gain) / largest, 0.0, 0.0)
+        for i in range(self.dynamics.d):
+            needed = (cs.DM(path.inertia[:, i]) * self.u + cs.DM(path.centrifugal[:, i]) * self.b
+                      + cs.DM(path.damping[:, i]) * self.s_dot + cs.DM(path.static[:, i]))  # fmt: skip
+            produced = sum(cs.DM(path.transmission[:, i, k]) * tau for k, tau in enumerate(self.tau))
+            self._require((needed - produced) / self.size, 0.0, 0.0)
+
+    def _add_limits(self) -> None:
+        """Limit accelerations, power, rates of torques, jerks and the duration."""
+        import casadi as cs
+
+        limits = self.limits
+        for at, acceleration in self.a.items():
+            self._limit(acceleration, limits.acceleration[at])
+        for k, (tau, power) in enumerate(zip(self.tau, self.power, strict=True)):
+            self._limit(power, limits.power[k])
+            self._limit_rate(tau, limits.torque_rate[k])
+        for i, at in enumerate(self.dynamics.q_at.tolist()):
+            self._limit_rate(self.a[at], limits.jerk[i])
         if np.isfinite(limits.time):
             self._require(cs.sum1(self.duration) / limits.time, -np.inf, 1.0)
-        highest = largest_path_rates(dynamics, path, limits)[1:-1] / largest
-        free = np.full(motors * points * bool(minimize.energy) + bool(minimize.peak_torque), np.inf)
-        self.lower = np.concatenate([np.full(points - 2, MIN_B), np.full(points, -np.inf),
-                                     np.repeat(limits.torque[0] / unit, points), 0 * np.zeros_like(free)])  # fmt: skip
-        self.upper = np.concatenate(
-            [highest, np.full(points, np.inf), np.repeat(limits.torque[1] / unit, points), free]
-        )
-        self.guess = np.concatenate([start_b[1:-1] / largest, start_u / largest, (start_tau / unit).T.ravel(),
-                                     (start_power.T.ravel() / power_unit)[: len(free)] if minimize.energy else [],
-                                     np.ones(int(bool(minimize.peak_torque)))])  # fmt: skip
+
+    def _add_parts(self, minimize: MinimizeSpec, drawn: Any, peak: Any) -> None:
+        """Add the parts of the cost that have weights."""
+        import casadi as cs
+
+        parts, duration = self.parts, self.duration
+        if minimize.time:
+            parts["time"] = cs.sum1(duration)
+        if minimize.effort:
+            parts["effort"] = sum(cs.dot(duration, x[1:] ** 2 + x[1:] * x[:-1] + x[:-1] ** 2) / 3 for x in self.tau)
+        if minimize.torque_rate:
+            parts["torque_rate"] = sum(self._integrate_squared_rate(x) for x in self.tau)
+        if minimize.jerk:
+            parts["jerk"] = sum(self._integrate_squared_rate(self.a[at]) for at in self.dynamics.q_at.tolist())
+        if minimize.energy:
+            drawn = self.power_unit * drawn
+            for k, power in enumerate(self.power):
+                self._require((drawn[:, k] - power) / self.power_unit, 0.0, np.inf)
+            parts["energy"] = sum(cs.dot(duration, drawn[1:, k] + drawn[:-1, k]) / 2 for k in range(len(self.power)))
+        if minimize.peak_torque:
+            top = float(self.unit.max())
+            for tau in self.tau:
+                self._require(peak - tau / top, 0.0, np.inf)
+                self._require(peak + tau / top, 0.0, np.inf)
+            parts["peak_torque"] = top * peak
+
+    def _integrate_squared_rate(self, values: Any) -> Any:
+        """Return the integral of the squared rate of a quantity that is linear between the points."""
+        import casadi as cs
+
+        return cs.sum1((values[1:] - values[:-1]) ** 2 / self.duration)
 
     def _require(self, expression: Any, low: float, high: float) -> None:
         self.rows.append(expression)

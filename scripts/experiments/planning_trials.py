@@ -110,7 +110,7 @@ def _make_crossings(
         end = sigma(other, start + case.spread * scale * random.uniform(-1, 1, mechanism.d), other.assembled)
         if end.verdict == "converged" and is_separated(mechanism, limits, mechanism.q_tree, end.at.q_tree):
             numbers = mechanism.tree.to_coordinates(end.at.q_tree)
-            turned = np.where(mechanism.tree.in_metres, numbers, (numbers + np.pi) % (2 * np.pi) - np.pi)
+            turned = np.where(mechanism.tree.is_angle, (numbers + np.pi) % (2 * np.pi) - np.pi, numbers)
             turned[other.partition.q] = numbers[other.partition.q]
             ends.append(dict(zip(mechanism.coordinates, turned.tolist(), strict=True)))
     begin = dict(zip(mechanism.independent, mechanism.independent_part(mechanism.q_tree).tolist(), strict=True))
