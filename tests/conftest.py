@@ -174,6 +174,11 @@ def quick_compiler() -> Iterator[None]:
         yield
 
 
+def forget_process_folder(patch: pytest.MonkeyPatch) -> None:
+    """Let the process find no terms that earlier tests have compiled without a cache."""
+    patch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
+
+
 def _shared_folder(tmp_path_factory: pytest.TempPathFactory, name: str) -> Path:
     """Return a folder that all workers of pytest-xdist have in common."""
     folder = tmp_path_factory.getbasetemp()
@@ -199,8 +204,7 @@ def compiled_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names.rotate(2 * int(worker.removeprefix("gw") or 0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
-        # Terms that an earlier test has compiled without a cache are in a folder of the process, and not in this one.
-        patch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
+        forget_process_folder(patch)
         for name in names:
             with (folder / f"{name}.lock").open("w", encoding="utf-8") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)

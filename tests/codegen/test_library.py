@@ -6,7 +6,6 @@ import os
 import stat
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +18,7 @@ from ckc_pin.run.simulate import run_prepared
 from ckc_pin.scene.parts import load_scene_mechanism
 from scripts.experiments.benchmark.growth import Case, write_case
 from scripts.experiments.generated_sizes import ring
+from tests.conftest import forget_process_folder
 from tests.contract.helpers.command import ckc
 
 NAME = "slider_crank"
@@ -28,7 +28,7 @@ NAME = "slider_crank"
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache, in a process that has compiled nothing."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
+    forget_process_folder(monkeypatch)
     return tmp_path / "ckc_pin" / "terms"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,9 @@ GRAVITY = 9.81
 REPLAY, CLOSURE = 1e-6, 1e-10  # of replays: rad, rad/s, m, m/s; largest |phi| of plans
 
 
-def slider(*, damping: float = 0.0, friction: float = 0.0, **motor: Any) -> Mechanism:
+def slider(
+    *, damping: float = 0.0, friction: float = 0.0, springs: Sequence[dict[str, Any]] = (), **motor: Any
+) -> Mechanism:
     """Return a mass on a horizontal rail: a double integrator."""
     urdf = f"""
     <robot name="slider">
@@ -31,8 +34,9 @@ def slider(*, damping: float = 0.0, friction: float = 0.0, **motor: Any) -> Mech
     </robot>"""
     joints = [{"name": "rail", "damping": damping, "friction": friction}] if damping or friction else []
     return Mechanism.from_urdf(
-        urdf, gravity=[0, 0, -GRAVITY], motors=[{"joint": "rail", **motor}], joints=joints, q_guess={"rail": 0.0}
-    )
+        urdf, gravity=[0, 0, -GRAVITY], motors=[{"joint": "rail", **motor}], joints=joints, springs=springs,
+        q_guess={"rail": 0.0},
+    )  # fmt: skip
 
 
 def table(**motor: Any) -> Mechanism:

@@ -27,19 +27,8 @@ def require_period(plan: Plan) -> None:
 
 def oscillator() -> Mechanism:
     """Return a mass on a rail with a spring and a damper."""
-    urdf = f"""
-    <robot name="oscillator">
-      <link name="base"/>
-      <link name="cart">
-        <inertial><mass value="{MASS}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-      </link>
-      <joint name="rail" type="prismatic">
-        <parent link="base"/><child link="cart"/><axis xyz="1 0 0"/>
-        <limit lower="-10" upper="10" effort="100" velocity="100"/>
-      </joint>
-    </robot>"""
     spring = {"joint": "rail", "stiffness": STIFFNESS, "damping": DAMPING}
-    return Mechanism.from_urdf(urdf, motors=[{"joint": "rail"}], springs=[spring], q_guess={"rail": 0.0})
+    return slider(springs=[spring])
 
 
 def test_fastest_cycle_between_two_places_is_bang_bang() -> None:
