@@ -73,7 +73,7 @@ class Collocation:
         self.unit = np.where(torque > 0, torque, typical)  # of torques
         self.force_unit = float(self.unit.max(initial=1.0))
         self.power_unit = self.force_unit * max(float(np.abs(guess.rates).max(initial=0.0)), 1e-9)
-        self.state_limits = StateLimits(dynamics, limits, start, self.power_unit if minimize.energy else None)
+        self.state_limits = StateLimits(dynamics, limits, start, self.power_unit, with_power=bool(minimize.energy))
         self.slacks = motors if minimize.energy else 0  # of each Gauss point
         self.q_tree = guess.q_tree
         self._number_variables()

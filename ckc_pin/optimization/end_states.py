@@ -67,7 +67,15 @@ def refuse_unsupported(
         and not any(others)
         and not np.isfinite(
             np.concatenate(
-                [limits.torque.ravel(), limits.rate, limits.acceleration, limits.jerk, limits.power, limits.speed]
+                [
+                    limits.torque.ravel(),
+                    limits.rate,
+                    limits.acceleration,
+                    limits.jerk,
+                    limits.power,
+                    [limits.total_power],
+                    limits.speed,
+                ]
             )
         ).any()
     ):

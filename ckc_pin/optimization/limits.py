@@ -29,6 +29,8 @@ class MotionLimits(Immutable):
     torque : (2, motors) array
     speed, power : (motors,) arrays
         Of the shafts.
+    total_power : float
+        W, upper limit of the sum over all motors.
     torque_rate : (motors,) array
     jerk : (d,) array
         Of the independent coordinates.
@@ -40,7 +42,8 @@ class MotionLimits(Immutable):
         Point, centre and radius.
     sphere_names : tuple of str
     names : tuple of str
-        Coordinates, rates, accelerations, shaft speeds, torques, power, and distances of points from spheres' centres.
+        Coordinates, rates, accelerations, shaft speeds, torques, power, their total, and distances of points from
+        spheres' centres.
     """
 
     q: Array
@@ -49,6 +52,7 @@ class MotionLimits(Immutable):
     torque: Array
     speed: Array
     power: Array
+    total_power: float
     torque_rate: Array
     jerk: Array
     time: float
@@ -61,7 +65,7 @@ class MotionLimits(Immutable):
         """Return the limits of rates, accelerations and motors narrowed by a part of themselves."""
         return replace(self, rate=self.rate * (1 - part), acceleration=self.acceleration * (1 - part),
                        torque=self.torque * (1 - part), speed=self.speed * (1 - part),
-                       power=self.power * (1 - part))  # fmt: skip
+                       power=self.power * (1 - part), total_power=self.total_power * (1 - part))  # fmt: skip
 
     def excess(self, quantities: Array) -> Array:
         """Return by how much quantities (m, names) exceed the limits, at most 0 inside, (m, names)."""
@@ -70,12 +74,20 @@ class MotionLimits(Immutable):
 
     def bounds(self) -> tuple[Array, Array]:
         """Return lower and upper limits of the quantities of `names`."""
-        rates, accelerations, speeds = self.rate, self.acceleration, self.speed
         radius = np.array([radius for _, _, radius in self.spheres])
-        return (
-            np.concatenate([self.q[0], -rates, -accelerations, -speeds, self.torque[0], -self.power, radius]),
-            np.concatenate([self.q[1], rates, accelerations, speeds, self.torque[1], self.power, np.inf + 0 * radius]),
-        )
+        lower = [self.q[0], -self.rate, -self.acceleration, -self.speed, self.torque[0], -self.power, [-np.inf], radius]
+        upper = [self.q[1], self.rate, self.acceleration, self.speed, self.torque[1], self.power, [self.total_power],
+                 np.full(len(radius), np.inf)]  # fmt: skip
+        return np.concatenate(lower), np.concatenate(upper)
+
+    def sizes(self, quantities: Array) -> Array:
+        """Return the sizes of quantities (m, names) that an excess is relative to, (names,)."""
+        largest = np.abs(quantities).max(axis=0)
+        first = len(self.names) - len(self.spheres)
+        largest[first:] = [radius for _, _, radius in self.spheres]
+        if np.isfinite(self.total_power):
+            largest[first - 1] = self.total_power
+        return np.maximum(largest, 1e-12)
 
 
 def make_limits(spec: LimitsSpec, mechanism: Mechanism) -> MotionLimits:
@@ -118,13 +130,14 @@ def make_limits(spec: LimitsSpec, mechanism: Mechanism) -> MotionLimits:
         torque=torque,
         speed=np.array(motors.speed_limit),
         power=_by_name(spec.power, motors.names, motors.names, f"{where}.power", "motor"),
+        total_power=np.inf if spec.total_power is None else spec.total_power,
         jerk=_by_name(spec.jerk, mechanism.independent, mechanism.independent, f"{where}.jerk", "coordinate"),
         torque_rate=_by_name(spec.torque_rate, motors.names, motors.names, f"{where}.torque_rate", "motor"),
         time=np.inf if spec.time is None else spec.time,
         singularity=spec.singularity or 0.0,
         spheres=tuple(spheres),
         sphere_names=sphere_names,
-        names=(*names, *prefixed, *sphere_names),
+        names=(*names, *prefixed, "total_power", *sphere_names),
     )
 
 

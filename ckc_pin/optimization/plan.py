@@ -231,7 +231,7 @@ class Plan(HasSummary):
     def columns(self) -> dict[str, Array]:
         """Return coordinates, rates, accelerations and motor torques by name at the instants `t`."""
         named = zip(self.limits.names, self.quantities.T, strict=True)
-        return {name: x for name, x in named if name.split(".")[0] not in ("speed", "power", "distance")}
+        return {name: x for name, x in named if name.split(".")[0] not in ("speed", "power", "total_power", "distance")}
 
     def scene(self, control: str = "open") -> Scene:
         """Return a scene that replays the plan.
@@ -472,14 +472,16 @@ def measure(
     """Return the quantities of `limits.names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
     shafts, distances = at.v_tree @ mechanism.motors.transmission.T, dynamics.distances(at.q_tree, limits.spheres)
-    quantities = np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, shafts * at.tau, distances])
+    power = shafts * at.tau
+    quantities = np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, power, power.sum(axis=1, keepdims=True),
+                            distances])  # fmt: skip
     return quantities, dynamics.margins(at.q_tree, mechanism.partition.z)
 
 
 def find_active(limits: MotionLimits, t: Array, quantities: Array, margin: Array) -> list[ActiveLimit]:
     """List the limits that quantities reach, each from one time to another, in the order of these times."""
     lower, upper = limits.bounds()
-    size = np.where(np.isfinite(upper) & np.isfinite(lower), upper - lower, np.maximum(np.abs(quantities).max(0), 1e-9))
+    size = np.where(np.isfinite(upper) & np.isfinite(lower), upper - lower, limits.sizes(quantities))
     reached: list[ActiveLimit] = []
     names = limits.names
     sides = [

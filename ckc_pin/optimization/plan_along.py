@@ -78,7 +78,7 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
 def _is_fastest(spec: OptimizeSpec, limits: MotionLimits) -> bool:
     """Whether the cost is the duration alone, within limits that the sweeps of `find_fastest` keep."""
     weights = [name for name in spec.minimize.__struct_fields__ if getattr(spec.minimize, name)]
-    others = np.concatenate([limits.torque_rate, limits.power, limits.jerk])
+    others = np.concatenate([limits.torque_rate, limits.power, [limits.total_power], limits.jerk])
     return weights == ["time"] and not np.isfinite(others).any()
 
 

@@ -257,10 +257,7 @@ def _assemble(
 
 def _find_excess(limits: MotionLimits, quantities: Array, margin: Array, samples: Array, rates: Array) -> Exceeded:
     """Find the intervals in which limits are exceeded, from samples of them and of the end."""
-    size = np.maximum(np.abs(quantities).max(axis=0), 1e-12)
-    if limits.spheres:
-        size[-len(limits.spheres) :] = [radius for _, _, radius in limits.spheres]
-    relative = limits.excess(quantities) / size
+    relative = limits.excess(quantities) / limits.sizes(quantities)
     close = 1 - margin[:, None] / limits.singularity if limits.singularity else np.zeros((len(margin), 0))
     relative = np.hstack([relative, close])
     at = relative > EXCESS

@@ -160,6 +160,8 @@ class _Problem:
         for k, (tau, power) in enumerate(zip(self.tau, self.power, strict=True)):
             self._limit(power, limits.power[k])
             self._limit_rate(tau, limits.torque_rate[k])
+        if np.isfinite(limits.total_power):
+            self._require(sum(self.power) / self.power_unit, -np.inf, limits.total_power / self.power_unit)
         for i, at in enumerate(self.dynamics.q_at.tolist()):
             self._limit_rate(self.a[at], limits.jerk[i])
         if np.isfinite(limits.time):

@@ -241,6 +241,9 @@ class LimitsSpec(FileStruct, frozen=True, kw_only=True):
     power : W
         Largest mechanical power of the motors, driving or braking, point to point; a table is by motor.
         ``power = 200.0``
+    total_power : W
+        Most mechanical power of all motors together, from a common supply. Braking motors give theirs to the others.
+        ``total_power = 500.0``
     time : s
         Longest duration.
         ``time = 1.0``
@@ -259,6 +262,7 @@ class LimitsSpec(FileStruct, frozen=True, kw_only=True):
     acceleration: Limit | dict[str, Limit] | None = None
     jerk: Limit | dict[str, Limit] | None = None
     power: Limit | dict[str, Limit] | None = None
+    total_power: Limit | None = None
     time: Limit | None = None
     singularity: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
     keep_out: list[KeepOutSpec] = []

@@ -29,8 +29,10 @@ class StateLimits:
     limits : MotionLimits
     start : (nq,) array
         Configuration to whose smallest singular value of phi_z `limits.singularity` is relative.
-    power_unit : float, optional
-        Adds the mechanical power of each motor in this unit, as the last functions, at most 0.
+    power_unit : float
+        W, of the total power, and of each motor's.
+    with_power : bool
+        Adds the mechanical power of each motor in its unit, as the last functions, at most 0.
 
     Attributes
     ----------
@@ -39,11 +41,11 @@ class StateLimits:
     """
 
     def __init__(
-        self, dynamics: ReducedDynamics, limits: MotionLimits, start: Array, power_unit: float | None = None
+        self, dynamics: ReducedDynamics, limits: MotionLimits, start: Array, power_unit: float, *, with_power: bool
     ) -> None:
         self._parts: list[tuple[StateFunctions, slice]] = []
-        rows = [row for row in _limited(dynamics, limits) if np.isfinite(row[2:]).any()]
-        if power_unit is not None:
+        rows = [row for row in _limited(dynamics, limits, power_unit) if np.isfinite(row[2:]).any()]
+        if with_power:
             motors, power = dynamics.mechanism.motors.names, _power(dynamics)
             rows += [(f"energy.{name}", power[k] / power_unit, -np.inf, 0.0) for k, name in enumerate(motors)]
         labels, bounds = [row[0] for row in rows], [row[2:] for row in rows]
@@ -83,7 +85,7 @@ class StateLimits:
                 total += some.transpose(0, 2, 1) @ second @ some
 
 
-def _limited(dynamics: ReducedDynamics, limits: MotionLimits) -> list[Row]:
+def _limited(dynamics: ReducedDynamics, limits: MotionLimits, power_unit: float) -> list[Row]:
     """Return the limited quantities in units of about their size."""
     import casadi as cs
 
@@ -102,6 +104,7 @@ def _limited(dynamics: ReducedDynamics, limits: MotionLimits) -> list[Row]:
     for k, name in enumerate(motors):
         rows += [_symmetric(f"speed.{name}", speed[k], limits.speed[k]),
                  _symmetric(f"power.{name}", power[k], limits.power[k])]  # fmt: skip
+    rows.append(("total_power", cs.sum1(power) / power_unit, -np.inf, limits.total_power / power_unit))
     points = dict(zip(mechanism.points, cs.vertsplit(dynamics.points, 3), strict=True)) if limits.spheres else {}
     for label, (point, centre, radius) in zip(limits.sphere_names, limits.spheres, strict=True):
         # The distance is nearly linear in the position; a small part of the radius makes it smooth at the centre.
