@@ -21,8 +21,9 @@ from ckc_pin.mechanism.rank import scale_jacobian
 from ckc_pin.optimization.free_path import MAX_ATTEMPTS, find_path, is_separated
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath
-from ckc_pin.optimization.plan import CoordinateMotion, Crossing
+from ckc_pin.optimization.plan import Crossing
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
+from ckc_pin.optimization.replay import CoordinateMotion
 
 __all__ = ["find_crossings", "find_routes"]
 

@@ -24,8 +24,8 @@ from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Places, Solution, times
 from ckc_pin.optimization.path import CoordinatePath, PathMotion
 from ckc_pin.optimization.phase_dynamics import PhaseDynamics
-from ckc_pin.optimization.plan import CoordinateMotion
 from ckc_pin.optimization.reduced import ReducedDynamics
+from ckc_pin.optimization.replay import CoordinateMotion
 from ckc_pin.optimization.route import Route
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.piecewise import PiecewisePolynomial
-from ckc_pin.optimization.plan import CoordinateMotion
+from ckc_pin.optimization.replay import CoordinateMotion
 
 __all__ = ["Joined", "Shifted", "Slowed", "SmoothMotion", "scale_durations"]
 

@@ -19,8 +19,9 @@ from ckc_pin.optimization.end_states import refuse_unsupported, require_inside, 
 from ckc_pin.optimization.free_path import search_path
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath, PathMotion, make_path
-from ckc_pin.optimization.plan import JUMP_GAP, Plan, find_active, measure, replay_plan
+from ckc_pin.optimization.plan import Plan, find_active, measure
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
+from ckc_pin.optimization.replay import JUMP_GAP, replay_plan
 from ckc_pin.optimization.smooth_profile import optimize_profile
 from ckc_pin.optimization.spec import OptimizeSpec, PathSpec, StateSpec
 from ckc_pin.optimization.speed_profile import SpeedProfile

@@ -22,8 +22,9 @@ from ckc_pin.optimization.ipopt import Ipopt
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import Guess, Mesh, Solution, times
 from ckc_pin.optimization.phase_dynamics import PhaseDynamics
-from ckc_pin.optimization.plan import JUMP_GAP, Cycle, Plan, find_active, measure, replay_plan
+from ckc_pin.optimization.plan import Plan, find_active, measure
 from ckc_pin.optimization.reduced import ReducedDynamics
+from ckc_pin.optimization.replay import JUMP_GAP, Cycle, replay_plan
 from ckc_pin.optimization.route import Route
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec
 

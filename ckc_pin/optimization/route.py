@@ -13,8 +13,8 @@ from ckc_pin.errors import InputError
 from ckc_pin.optimization.along_path import minimum_norm_within
 from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.mesh_motion import Guess, Places, Solution
-from ckc_pin.optimization.plan import Section
 from ckc_pin.optimization.reduced import ReducedDynamics
+from ckc_pin.optimization.replay import Section
 
 __all__ = ["Route", "Stay"]
 
