@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.dynamics.inverse import friction_force
-from ckc_pin.errors import InputError
+from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.along_path import (
     PathDynamics,
@@ -40,6 +42,7 @@ FORCE_TOLERANCE = 1e-8  # relative to the largest force: what torques within lim
 TORQUE_TOLERANCE = 1e-6  # relative to the largest torque: error of linear interpolation between rows
 MAX_ROWS = 32  # of the torques' table in an interval
 TIME_TOLERANCE = 1e-6  # relative, of limits.time
+INTERVAL_TIME_TOLERANCE = 1e-3  # of the duration: error of the time of an interval, above which it is divided
 DURATION_GUESS = 1.0  # s: of the initial guess if nothing limits the speed
 
 
@@ -59,10 +62,6 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
     path = make_path(table, mechanism) if table.shape != "free" else _find_free_path(dynamics, spec, table, limits)
     motion, iterations, parts = _refine_profile(dynamics, path, limits, spec)
     t_end = float(motion.corners[-1])
-    if t_end > limits.time * (1 + TIME_TOLERANCE):
-        raise InputError(
-            f"optimize: infeasible: limits.time = {limits.time:g} s: the fastest motion takes {t_end:.6g} s"
-        )
     t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2))
     quantities, margin = measure(mechanism, dynamics, limits, at)
     replay = replay_plan(mechanism, dynamics, motion, at, t, torque)
@@ -118,31 +117,52 @@ def _refine_profile(
     inside = np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 2)[1:-1]
     suspect: BoolArray | None = None  # intervals to check; all of them before the end
     is_fastest = _is_fastest(spec, limits)
+    time = limits.time  # limit of the optimizer's duration, which assumes uniform acceleration in each interval
     for round_ in range(MAX_REFINEMENTS):
         along = path_dynamics(dynamics, path, s)
         _require_within(limits, along, dynamics)
         if _is_bounded(limits):
             profile, iterations = find_fastest(dynamics, along, narrowed)
+            _require_time(profile, limits)
         else:
             profile, iterations = _make_triangle(s, limits.time), 0
-        parts = {"time": float(profile.t[-1])}
+        parts, is_on_time = {"time": float(profile.t[-1])}, True
         if not is_fastest:
-            optimum = optimize_profile(dynamics, along, narrowed, spec.minimize, profile)
+            optimum = optimize_profile(dynamics, along, replace(narrowed, time=time), spec.minimize, profile)
             profile, iterations, parts = optimum.profile, optimum.iterations, optimum.parts
+            parts |= {"time": float(profile.t[-1])} if "time" in parts else {}
+            misses = float(profile.t[-1]) / limits.time - 1
+            is_free = _uniform_times(profile).sum() < time * (1 - TIME_TOLERANCE)
+            is_on_time = misses < TIME_TOLERANCE and (is_free or misses > -TIME_TOLERANCE)
+            time = time if is_on_time else time / (1 + misses)
         motion, total = PathMotion(path, profile), total + iterations
-        exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect)
+        exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect) | _misses_time(profile)
         if round_ < SWITCH_REFINEMENTS and is_fastest:
             exceeded |= _switches(profile)
         if not exceeded.any() and suspect is not None:
             exceeded = _exceeds_inside(dynamics, motion, between, inside, None)
+        if not exceeded.any() and is_on_time:
+            return motion, total, parts
         if not exceeded.any():
-            break
+            suspect = None
+            continue
         exceeded[1:] |= exceeded[:-1].copy()
         exceeded[:-1] |= exceeded[1:].copy()
         counts = np.where(exceeded, DIVISION, 1)
         suspect = np.repeat(exceeded, counts)
         s = np.append(np.repeat(s[:-1], counts) + np.repeat(np.diff(s), counts) * _parts(counts), s[-1])
-    return motion, total, parts
+    raise NumericalError(
+        f"optimize: stuck: limits are exceeded between the points of a grid of {len(s) - 1} intervals along the path; "
+        "give other intervals or limits"
+    )
+
+
+def _require_time(profile: SpeedProfile, limits: MotionLimits) -> None:
+    """Require that the fastest motion takes at most `limits.time` (InputError)."""
+    if profile.t[-1] > limits.time * (1 + TIME_TOLERANCE):
+        raise InputError(
+            f"optimize: infeasible: limits.time = {limits.time:g} s: the fastest motion takes {profile.t[-1]:.6g} s"
+        )
 
 
 def _is_bounded(limits: MotionLimits) -> bool:
@@ -154,6 +174,18 @@ def _make_triangle(s: Array, duration: float) -> SpeedProfile:
     """Return the profile that accelerates uniformly up to the middle, and brakes from there on."""
     acceleration = 4 / (duration if np.isfinite(duration) else DURATION_GUESS) ** 2
     return SpeedProfile(s, 2 * acceleration * np.minimum(s - s[0], s[-1] - s), np.zeros(len(s) - 1))
+
+
+def _uniform_times(profile: SpeedProfile) -> Array:
+    """Return the times that uniform acceleration between its ends takes in each interval, s."""
+    speed = np.sqrt(profile.b)
+    return np.asarray(2 * np.diff(profile.s) / (speed[1:] + speed[:-1]))
+
+
+def _misses_time(profile: SpeedProfile) -> BoolArray:
+    """Return whether uniform acceleration takes another time than the motion, in each interval."""
+    missed = np.abs(np.diff(profile.t) - _uniform_times(profile))
+    return np.asarray(missed > INTERVAL_TIME_TOLERANCE * profile.t[-1])
 
 
 def _switches(profile: SpeedProfile) -> BoolArray:

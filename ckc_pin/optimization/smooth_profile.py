@@ -86,8 +86,8 @@ def optimize_profile(
 class _Problem:
     """The nonlinear program of a profile.
 
-    Variables are b between both ends, u and the motor torques at all points, the power that each motor draws at all
-    points if energy has a weight, and the largest torque if it has one.
+    Variables are b between both ends, u and the motor torques at all points, the work that each motor gives by s at
+    all points if energy has a weight, and the largest torque if it has one.
     """
 
     def __init__(
@@ -106,15 +106,15 @@ class _Problem:
         u = np.gradient(b, path.s) / 2
         force = path.force(u, b)
         torque = minimum_norm_within(path.transmission, force, limits.torque)
-        power = np.maximum(torque * self.shafts * np.sqrt(b)[:, None], 0.0)
+        work = np.maximum(torque * self.shafts, 0.0)  # by s
         self.size = float(np.abs(force).max())
         self.unit = np.maximum(np.abs(torque).max(axis=0), 1e-9 * max(self.size, 1e-9))
-        self.power_unit = max(float(power.max(initial=0.0)), 1e-9)
+        self.work_unit = max(float(work.max(initial=0.0)), 1e-9)
         blocks = {
             "b": (b[1:-1] / largest, MIN_B, largest_path_rates(dynamics, path, limits)[1:-1] / largest),
             "u": (u / largest, -np.inf, np.inf),
             "tau": ((torque / self.unit).T.ravel(), *(np.repeat(x / self.unit, points) for x in limits.torque)),
-            "power": ((power / self.power_unit).T.ravel() if minimize.energy else np.zeros(0), 0.0, np.inf),
+            "work": ((work / self.work_unit).T.ravel() if minimize.energy else np.zeros(0), 0.0, np.inf),
             "peak": (np.ones(1 if minimize.peak_torque else 0), 0.0, np.inf),
         }
         guesses, lower, upper = zip(*blocks.values(), strict=True)
@@ -132,18 +132,19 @@ class _Problem:
         self.power = [self.tau[k] * cs.DM(self.shafts[:, k]) * self.s_dot for k in range(motors)]
         self.a = {k: cs.DM(path.v_tree[:, k]) * self.u + cs.DM(path.a_tree[:, k]) * self.b
                   for k in range(dynamics.n) if k in dynamics.q_at or np.isfinite(limits.acceleration[k])}  # fmt: skip
-        drawn = cs.reshape(w["power"], -1, motors) if minimize.energy else None
+        drawn = cs.reshape(w["work"], -1, motors) if minimize.energy else None
         self._add_equations(largest)
         self._add_limits()
         self._add_parts(minimize, drawn, w["peak"])
 
     def _add_equations(self, largest: float) -> None:
-        """Require that b belongs to u, and eq. 6 at all points."""
+        """Require that b belongs to u and is positive between the points, and eq. 6 at all points."""
         import casadi as cs
 
-        path = self.path
-        gain = cs.DM(np.diff(path.s)) * (self.u[1:] + self.u[:-1])
-        self._require((self.b[1:] - self.b[:-1] - gain) / largest, 0.0, 0.0)
+        path, step = self.path, cs.DM(np.diff(self.path.s))
+        self._require((self.b[1:] - self.b[:-1] - step * (self.u[1:] + self.u[:-1])) / largest, 0.0, 0.0)
+        # b is a quadratic polynomial of s in each interval, positive inside if its second Bernstein coefficient is.
+        self._require((self.b[:-1] + step * self.u[:-1]) / largest, MIN_B, np.inf)
         for i in range(self.dynamics.d):
             needed = (cs.DM(path.inertia[:, i]) * self.u + cs.DM(path.centrifugal[:, i]) * self.b
                       + cs.DM(path.damping[:, i]) * self.s_dot + cs.DM(path.static[:, i]))  # fmt: skip
@@ -161,13 +162,13 @@ class _Problem:
             self._limit(power, limits.power[k])
             self._limit_rate(tau, limits.torque_rate[k])
         if np.isfinite(limits.total_power):
-            self._require(sum(self.power) / self.power_unit, -np.inf, limits.total_power / self.power_unit)
+            self._require(sum(self.power) / float(limits.total_power), -np.inf, 1.0)
         for i, at in enumerate(self.dynamics.q_at.tolist()):
             self._limit_rate(self.a[at], limits.jerk[i])
         if np.isfinite(limits.time):
             self._require(cs.sum1(self.duration) / limits.time, -np.inf, 1.0)
 
-    def _add_parts(self, minimize: MinimizeSpec, drawn: Any, peak: Any) -> None:
+    def _add_parts(self, minimize: MinimizeSpec, work: Any, peak: Any) -> None:
         """Add the parts of the cost that have weights."""
         import casadi as cs
 
@@ -181,10 +182,11 @@ class _Problem:
         if minimize.jerk:
             parts["jerk"] = sum(self._integrate_squared_rate(self.a[at]) for at in self.dynamics.q_at.tolist())
         if minimize.energy:
-            drawn = self.power_unit * drawn
-            for k, power in enumerate(self.power):
-                self._require((drawn[:, k] - power) / self.power_unit, 0.0, np.inf)
-            parts["energy"] = sum(cs.dot(duration, drawn[1:, k] + drawn[:-1, k]) / 2 for k in range(len(self.power)))
+            step, energy = cs.DM(np.diff(self.path.s)), 0
+            for k, tau in enumerate(self.tau):
+                self._require(work[:, k] - tau * cs.DM(self.shafts[:, k]) / self.work_unit, 0.0, np.inf)
+                energy += self.work_unit * cs.dot(step, work[1:, k] + work[:-1, k]) / 2
+            parts["energy"] = energy
         if minimize.peak_torque:
             top = float(self.unit.max())
             for tau in self.tau:
