@@ -43,19 +43,20 @@ class StateLimits:
     def __init__(
         self, dynamics: ReducedDynamics, limits: MotionLimits, start: Array, power_unit: float, *, with_power: bool
     ) -> None:
-        self._parts: list[tuple[StateFunctions, slice]] = []
         rows = [row for row in _limited(dynamics, limits, power_unit) if np.isfinite(row[2:]).any()]
         if with_power:
             motors, power = dynamics.mechanism.motors.names, _power(dynamics)
             rows += [(f"energy.{name}", power[k] / power_unit, -np.inf, 0.0) for k, name in enumerate(motors)]
         labels, bounds = [row[0] for row in rows], [row[2:] for row in rows]
-        if rows:
-            self._parts.append((ExpressionFunctions(dynamics, [row[1] for row in rows]), slice(0, len(rows))))
+        self._parts: list[tuple[StateFunctions, slice]] = []
         if limits.singularity and len(dynamics.z_at):
             measure = SmallestSingularValue(dynamics, dynamics.smallest_singular_values(start[None])[0])
-            self._parts.append((measure, slice(len(rows), len(rows) + 1)))
-            labels.append("sigma_min")
-            bounds.append((limits.singularity, np.inf))
+            self._parts.append((measure, slice(0, 1)))
+            labels.insert(0, "sigma_min")
+            bounds.insert(0, (limits.singularity, np.inf))
+        if rows:
+            columns = slice(len(labels) - len(rows), len(labels))
+            self._parts.append((ExpressionFunctions(dynamics, [row[1] for row in rows]), columns))
         self.labels = tuple(labels)
         self.bounds: Array = np.array(bounds).reshape(-1, 2).T
 

@@ -230,3 +230,12 @@ def test_wrong_limits_and_weights_are_explained(change: dict[str, Any], message:
 def test_a_limit_that_no_motion_holds_ends_with_a_reason() -> None:
     with pytest.raises(NumericalError, match=r"optimize: (infeasible|stuck|budget): .*"):
         optimize(slider(), to=TO, limits={"torque": FORCE, "power": 0.01, "time": 0.8})
+
+
+def test_limits_that_are_not_reached_do_not_change_the_least_energy() -> None:
+    """The energy's variables stay with its equations, whatever other functions of the state are limited."""
+    task: dict[str, Any] = {"to": {"q": {"crank": 2.0}}, "minimize": {"time": 1.0, "energy": 0.3}}
+    alone = optimize("slider_crank", **task, limits={"torque": 3.0})
+    limits = {"torque": 3.0, "singularity": 0.1, "power": 1000.0, "total_power": 1000.0, "rate": {"rod": 1000.0}}
+    limited = optimize("slider_crank", **task, limits=limits)
+    assert limited.cost == pytest.approx(alone.cost, rel=1e-6)
