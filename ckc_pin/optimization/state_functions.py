@@ -93,14 +93,17 @@ class SmallestSingularValue:
         weights = cs.SX.sym("weights", column.numel())
         self._phi_z = InstantsFunction.of([q], [phi_z])
         self._jacobian = InstantsFunction.of([q], [cs.vertcat(*cast("list[Any]", jacobian.nonzeros()))])
+        self._last: tuple[MotionInstants, tuple[Array, Array, Array, Array, Array]] | None = None
         self._second = InstantsFunction.of([q, weights], [cs.hessian(cs.dot(weights, column), q)[0]])
 
     def _decompose(self, at: MotionInstants) -> tuple[Array, Array, Array, Array, Array]:
         """Return singular vectors and values, the smooth minimum, and its derivatives by the values."""
-        U, sigma, Vt = np.linalg.svd(self._phi_z(at.q_tree)[0])
-        sigma_min = sigma[:, -1:]
-        bound = sigma_min * np.sum((sigma_min / sigma) ** SHARPNESS, axis=1, keepdims=True) ** (-1 / SHARPNESS)
-        return U, sigma, Vt, bound, (bound / sigma) ** (SHARPNESS + 1)
+        if self._last is None or self._last[0] is not at:
+            U, sigma, Vt = np.linalg.svd(self._phi_z(at.q_tree)[0])
+            sigma_min = sigma[:, -1:]
+            bound = sigma_min * np.sum((sigma_min / sigma) ** SHARPNESS, axis=1, keepdims=True) ** (-1 / SHARPNESS)
+            self._last = at, (U, sigma, Vt, bound, (bound / sigma) ** (SHARPNESS + 1))
+        return self._last[1]
 
     def values(self, at: MotionInstants) -> Array:
         """Return the bound, (m, 1)."""
