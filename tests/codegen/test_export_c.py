@@ -17,7 +17,10 @@ import pytest
 from ckc_pin import InputError, load, load_scene
 from ckc_pin.base.arrays import Array
 from ckc_pin.formats.c.names import comment, identifiers
+from ckc_pin.formats.c.writer import TEMPLATES as C_TEMPLATES
+from ckc_pin.formats.c.writer import make_prefix
 from ckc_pin.formats.exporting import export, write
+from ckc_pin.formats.fmu.writer import TEMPLATES as FMU_TEMPLATES
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
@@ -27,7 +30,7 @@ from tests.contract.helpers.command import ckc
 
 MECHANISMS = ["five_bar", "delta", "stewart", "three_rrr", "andrews"]
 REDUNDANT_OR_OPEN = ["bricard", "flyball"]  # a redundant row; no loop at all
-WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
+WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic")
 SANITIZERS = ("-std=c99", "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 EXACT = 1e-11  # relative
 LIBM = {"sin", "cos", "sqrt", "fabs", "fmin", "fmax", "atan2", "tan", "sincos"}  # GCC joins sin and cos
@@ -286,6 +289,14 @@ def test_names_that_c_cannot_have_are_mapped_and_listed(tmp_path: Path) -> None:
     header = (folder / "five_bar.h").read_text(encoding="ascii")
     assert re.search(r"FIVE_BAR_V_TH_TA_1___ +th\\xe9ta-1 \* / ", header)
     run("gcc", *WARNINGS, "-c", "five_bar.c", "-o", "five_bar.o", cwd=folder)
+
+
+def test_prefixes_are_not_names_of_other_sources() -> None:
+    """A file of the mechanism would replace a template of the same name."""
+    stems = {path.stem for folder in (C_TEMPLATES, FMU_TEMPLATES) for path in folder.glob("*.c")}
+    others = {stem for stem in stems if not stem.startswith("mech")}
+    assert {"main", "fmu", "stops"} <= others
+    assert not others & {make_prefix(stem) for stem in others}
 
 
 def test_identifiers_are_valid_and_different() -> None:

@@ -29,11 +29,12 @@ __all__ = ["TEMPLATES", "fill_templates", "make_prefix", "require_exportable", "
 
 TEMPLATES = Path(__file__).parent / "templates"  # `mech` and `MECH` in names and texts are replaced by the prefix
 FRAME_BYTES = 256  # of a call: return address, saved registers, parameters, loop counters
-# Names of headers of C99, of `main.c` and of CMake's targets, which a prefix must not take.
+# Names of headers of C99, of `main.c`, of CMake's targets and of an FMU's sources, which a prefix must not take.
 RESERVED_PREFIXES = {
     "assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math", "setjmp",
     "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar", "wctype",
     "features", "main", "all", "clean", "help", "install", "package", "test", "c", "m", "t",
+    "fmu", "fmi2", "fmi3", "stops", "directional_derivatives", "co_simulation",
 }  # fmt: skip
 
 

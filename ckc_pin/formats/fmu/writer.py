@@ -34,6 +34,7 @@ __all__ = ["FMI_VERSIONS", "to_fmu"]
 
 FMI_VERSIONS = ("2.0", "3.0")
 TEMPLATES = Path(__file__).parent / "templates"
+INCLUDED = ("fmu.c", "stops.c", "directional_derivatives.c", "co_simulation.c")  # by the source of either version
 SYSTEMS = {"Linux": ("linux", ".so"), "Darwin": ("darwin", ".dylib")}
 MACHINES = {"AMD64": "x86_64", "arm64": "aarch64"}
 ZERO_ACCELERATION = 1e-10  # rad/s^2, or sizes of the mechanism per s^2: smaller forces of stops count as zero
@@ -131,8 +132,8 @@ def _describe_differences(scene: Scene) -> list[str]:
 def _write_sources(
     mechanism: Mechanism, prefix: str, source: str, start: Start, epsilon: float | None, rtol: float
 ) -> dict[str, str]:
-    names = {C_TEMPLATES: ("mech.c", "mech.h"), TEMPLATES: ("fmu.c", "stops.c", source)}
-    texts = {name: (folder / name).read_text(encoding="ascii") for folder, members in names.items() for name in members}
+    paths = [C_TEMPLATES / "mech.c", C_TEMPLATES / "mech.h", *(TEMPLATES / name for name in (*INCLUDED, source))]
+    texts = {path.name: path.read_text(encoding="ascii") for path in paths}
     stops, tree = list_stops(mechanism), mechanism.tree
     inertia = np.diag(Terms(mechanism, start.at, np.zeros(mechanism.n)).D_tree) * tree.step_scale
     more = {
@@ -150,10 +151,10 @@ def _write_sources(
         "START_RATES": initializer(start.q_dot),
         "STATE": initializer(sorted(mechanism.partition.q.tolist())),
         "STAGES": str(len(DOP853.B)),
-        "A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
-        "B": initializer(DOP853.B),
-        "E3": initializer(DOP853.E3),
-        "E5": initializer(DOP853.E5),
+        "DOP853_A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
+        "DOP853_B": initializer(DOP853.B),
+        "DOP853_E3": initializer(DOP853.E3),
+        "DOP853_E5": initializer(DOP853.E5),
     }
     return fill_templates(mechanism, prefix, texts, more, derivatives=True)
 
