@@ -116,7 +116,7 @@ def require_exportable(mechanism: Mechanism, where: str) -> None:
     if rough:
         raise InputError(
             f"{where}: dry friction of {', '.join(rough)} is not supported, since sticking needs events; set "
-            "friction = 0, and add friction as a force outside of the exported code"
+            f"friction = 0 (--set joint.{rough[0]}.friction=0), and add friction as a force outside of the code"
         )
     if mechanism.d == 0:
         raise InputError(f"{where}: the mechanism has no freedom, so there is nothing to control")

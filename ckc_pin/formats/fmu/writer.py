@@ -27,6 +27,7 @@ from ckc_pin.formats.fmu.model_description import build_description, describe_mo
 from ckc_pin.formats.fmu.variables import list_stops, list_variables, to_xml_name
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start, find_start
+from ckc_pin.scene.names import shorten_scene_name
 from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import Scene
 
@@ -62,7 +63,8 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     _require_plant(scene, mechanism, where)
     require_exportable(mechanism, where)
     start = find_start(mechanism, scene)
-    stem = re.sub(r"[^\w.-]+", "_", scene.name)
+    name = shorten_scene_name(scene.name)
+    stem = re.sub(r"[^\w.-]+", "_", name)
     prefix, spec = make_prefix(stem), scene.spec
     epsilon = spec.epsilon if spec.formulation == "spf" else None
     variables, renamed = list_variables(mechanism, start.at.q_tree, start.q_dot, epsilon)
@@ -75,7 +77,7 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     tool = f"ckc_pin {version('ckc_pin')}"
     entries: dict[str, str | bytes] = {
         "modelDescription.xml": describe_model(
-            fmi, to_xml_name(scene.name), prefix, identity, tool, variables, experiment, source
+            fmi, to_xml_name(name), prefix, identity, tool, variables, experiment, source
         ),
         **{f"sources/{name}": content for name, content in sources.items()},
     }
@@ -103,14 +105,18 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
             "it (--unset controller), and control the FMU in the importer, for example with the C code of --to c"
         )
     if spec.prescribed:
-        raise InputError(f"{where}: prescribed joints are not supported; remove prescribed, and give forces as inputs")
+        raise InputError(
+            f"{where}: prescribed joints are not supported; remove them (--unset prescribed), and use motor torques as "
+            "inputs"
+        )
     if spec.force or scene.forces:
         names = ", ".join(str(force.frame) for force in spec.force) or "Python functions"
         raise InputError(
-            f"{where}: forces on links ({names}) are not supported; remove them, and use the inputs force.COORDINATE"
+            f"{where}: forces on links ({names}) are not supported; remove them (--unset force), and use the inputs "
+            "force.COORDINATE"
         )
     if spec.initial.w is not None and np.any(spec.initial.w):
-        raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it")
+        raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it (--unset initial.w)")
     if spec.formulation == "spf" and mechanism.tree.free_roots:
         raise InputError(
             f"{where}: model exchange by the SPF is not supported for free roots, whose quaternions need length 1; "
@@ -120,8 +126,9 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
 
 def _describe_differences(scene: Scene) -> list[str]:
     notes = []
-    if scene.spec.event or scene.events:
-        notes.append("the scene's events are left out")
+    if events := [*scene.spec.event, *scene.events]:
+        stops = any(event.stop for event in events)
+        notes.append(f"the scene's events are left out{': the FMU goes on where a run stops' if stops else ''}")
     if scene.spec.work:
         notes.append("work is left out")
     if scene.spec.formulation == "spf":
