@@ -310,6 +310,15 @@ def test_export_to_c_refuses_dry_friction(tmp_path: Path) -> None:
         export(mechanism, "c")
 
 
+def test_export_to_c_refuses_independent_coordinates_of_a_free_root(tmp_path: Path) -> None:
+    make_mechanism(tmp_path)
+    (tmp_path / "mechanism.toml").write_text('name = "swarm"\n[[tree]]\nfile = "five_bar.urdf"\nroot = "free"\n')
+    with pytest.raises(
+        InputError, match=r"swarm: export to c: independent coordinates of a free root .root.x, .* joints"
+    ):
+        export(load(tmp_path), "c")
+
+
 def test_export_to_c_refuses_large_trees() -> None:
     with pytest.raises(InputError, match=r"export to c: .* terms are compiled for trees of up to 130 coordinates"):
         export(load_scene_mechanism(load_scene("n_four_bar", {"mechanism.N": 70})), "c")

@@ -120,11 +120,10 @@ def require_exportable(mechanism: Mechanism, where: str) -> None:
         )
     if mechanism.d == 0:
         raise InputError(f"{where}: the mechanism has no freedom, so there is nothing to control")
-    roots = [*mechanism.independent_root_coordinates, *(["a free root"] if mechanism.splits_root else [])]
-    if roots:
+    if roots := mechanism.independent_root_coordinates:
         raise InputError(
-            f"{where}: the independent coordinates must be joints, but {', '.join(roots)} belongs to a free root; name "
-            "joints as independent, if the loops allow it"
+            f"{where}: independent coordinates of a free root ({', '.join(roots)}) are not supported; name joints as "
+            "independent, if the loops allow it"
         )
 
 
