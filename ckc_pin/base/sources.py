@@ -120,7 +120,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes], overwrite: bool)
     """
     existing = [str(folder / file) for file in files if lexists(folder / file)]
     if existing and not overwrite:
-        raise InputError(f"{' and '.join(existing)}: there already; write elsewhere with --out DIR, or say --overwrite")
+        raise InputError(f"{', '.join(existing)}: there already; write elsewhere with --out DIR, or say --overwrite")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

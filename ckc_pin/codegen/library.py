@@ -73,7 +73,7 @@ def explain_too_large(mechanism: Mechanism) -> str:
     if mechanism.n <= MAX_COORDINATES and moved <= MAX_MOVED_JOINTS:
         return ""
     return (
-        f"{mechanism.name}: {mechanism.n} coordinates, which move {moved} joints, each its own and those behind it; "
+        f"{mechanism.n} coordinates, which move {moved} joints, each its own and those behind it; "
         f"terms are compiled for trees of up to {MAX_COORDINATES} coordinates that move up to {MAX_MOVED_JOINTS}"
     )
 
@@ -128,7 +128,7 @@ def compile_terms(
         terms differ from Pinocchio's.
     """
     if limited and (reason := explain_too_large(mechanism)):
-        raise InputError(reason)
+        raise InputError(f"{mechanism.name}: {reason}")
     subject = _Subject.of(mechanism, which, directional_derivatives, of_members)
     is_used = _process_folder.cache_info().currsize > 0  # by terms that the cache could not take
     for folder in (cache_folder(), *([_process_folder()] if is_used else [])):

@@ -187,6 +187,8 @@ def mechanism_file(name: str | Path) -> Path:
     """
     if isinstance(name, Path) or is_path(name):
         path = Path(name)
+        if path.name.endswith(".scene.toml"):
+            raise InputError(f"{path}: a scene; expected a mechanism, such as the one that the scene names")
         return path / MECHANISM_FILE if isdir(path) else path
     path = library() / name / MECHANISM_FILE
     if Path(name).name != name or not isfile(path):

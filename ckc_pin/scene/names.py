@@ -17,6 +17,7 @@ __all__ = [
     "is_scene_name",
     "list_catalogue",
     "list_scene_names",
+    "shorten_scene_name",
 ]
 
 SUFFIX = ".scene.toml"
@@ -71,8 +72,16 @@ def _find_default(folder: Path) -> Path:
 
 def describe_scene_name(name: str | Path, path: Path) -> str:
     """Return the user's name for a scene, or FOLDER/SCENE if the user gave a folder."""
-    if not isdir(name):
-        return str(name)
+    return _join_folder_and_scene(path) if isdir(name) else str(name)
+
+
+def shorten_scene_name(name: str) -> str:
+    """Return FOLDER/SCENE for the name of a scene that is the path of its file, and other names as they are."""
+    files = (Path(file) for file in (name, f"{name}{SUFFIX}") if file.endswith(SUFFIX) and isfile(file))
+    return next(map(_join_folder_and_scene, files), name)
+
+
+def _join_folder_and_scene(path: Path) -> str:
     scene = path.name.removesuffix(SUFFIX)
     return path.parent.resolve().name + ("" if scene == DEFAULT else f"/{scene}")
 

@@ -363,6 +363,20 @@ def importers(fmusim: Annotated[Path, typer.Argument(exists=True, dir_okay=False
     raise typer.Exit(importers.main(fmusim))
 
 
+@app.command("exported_code", epilog=examples("exported_code", "exported_code five_bar"))
+def exported_code(
+    names: Annotated[list[str] | None, typer.Argument(metavar="MECHANISM", show_default=False)] = None,
+) -> None:
+    """Check exported C code and FMUs with compilers and analyzers, and time the controllers.
+
+    Uses GCC, Clang, their sanitizers, cppcheck, and an emulated ARM processor. Exits with 1 if a check fails.
+    """
+    from scripts.experiments import exported_code
+
+    chosen = check_names(names, exported_code.MECHANISMS, "mechanism") or exported_code.MECHANISMS
+    raise typer.Exit(exported_code.main(chosen))
+
+
 @app.command(epilog=examples("planning", "planning five_bar --tasks 10"))
 def planning(
     cases: Annotated[list[str] | None, typer.Argument(metavar="CASE", show_default=False)] = None,

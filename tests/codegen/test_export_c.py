@@ -17,7 +17,10 @@ import pytest
 from ckc_pin import InputError, load, load_scene
 from ckc_pin.base.arrays import Array
 from ckc_pin.formats.c.names import comment, identifiers
+from ckc_pin.formats.c.writer import TEMPLATES as C_TEMPLATES
+from ckc_pin.formats.c.writer import make_prefix
 from ckc_pin.formats.exporting import export, write
+from ckc_pin.formats.fmu.writer import TEMPLATES as FMU_TEMPLATES
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.tables import core_table
@@ -27,7 +30,7 @@ from tests.contract.helpers.command import ckc
 
 MECHANISMS = ["five_bar", "delta", "stewart", "three_rrr", "andrews"]
 REDUNDANT_OR_OPEN = ["bricard", "flyball"]  # a redundant row; no loop at all
-WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
+WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", "-pedantic")
 SANITIZERS = ("-std=c99", "-O0", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 EXACT = 1e-11  # relative
 LIBM = {"sin", "cos", "sqrt", "fabs", "fmin", "fmax", "atan2", "tan", "sincos"}  # GCC joins sin and cos
@@ -288,6 +291,14 @@ def test_names_that_c_cannot_have_are_mapped_and_listed(tmp_path: Path) -> None:
     run("gcc", *WARNINGS, "-c", "five_bar.c", "-o", "five_bar.o", cwd=folder)
 
 
+def test_prefixes_are_not_names_of_other_sources() -> None:
+    """A file of the mechanism would replace a template of the same name."""
+    stems = {path.stem for folder in (C_TEMPLATES, FMU_TEMPLATES) for path in folder.glob("*.c")}
+    others = {stem for stem in stems if not stem.startswith("mech")}
+    assert {"main", "fmu", "stops"} <= others
+    assert not others & {make_prefix(stem) for stem in others}
+
+
 def test_identifiers_are_valid_and_different() -> None:
     assert identifiers(["a-b", "a_b", "a.b", "c"]) == ["a_b", "a_b_2", "a_b_3", "c"]
     assert comment("a */ b /* c\n?\\") == "a * / b / * c ?"
@@ -297,6 +308,15 @@ def test_export_to_c_refuses_dry_friction(tmp_path: Path) -> None:
     mechanism = make_mechanism(tmp_path, extra='\n[[joint]]\nname = "theta_2"\nfriction = 0.1\n')
     with pytest.raises(InputError, match=r"five_bar: export to c: dry friction of theta_2 .* set friction = 0"):
         export(mechanism, "c")
+
+
+def test_export_to_c_refuses_independent_coordinates_of_a_free_root(tmp_path: Path) -> None:
+    make_mechanism(tmp_path)
+    (tmp_path / "mechanism.toml").write_text('name = "swarm"\n[[tree]]\nfile = "five_bar.urdf"\nroot = "free"\n')
+    with pytest.raises(
+        InputError, match=r"swarm: export to c: independent coordinates of a free root .root.x, .* joints"
+    ):
+        export(load(tmp_path), "c")
 
 
 def test_export_to_c_refuses_large_trees() -> None:

@@ -325,6 +325,22 @@ def test_export_refuses_friction_prescribed_joints_and_other_versions(tmp_path: 
         export(scene_of("five_bar"), "fmu", fmi="1.0")
 
 
+def test_file_of_a_scene_given_by_path_is_named_after_its_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "my robot"
+    scene = load_scene("five_bar/swing").save(folder, "fall")
+    with optimization("-O0"):
+        (file,) = export(load_scene(scene), "fmu").files
+    assert file == "my_robot_fall.fmu"
+
+
+@pytest.mark.parametrize(("stop", "note"), [(False, ""), (True, ": the FMU goes on where a run stops")])
+def test_events_of_a_scene_are_reported_as_left_out(stop: bool, note: str) -> None:
+    event = {"coordinate": "theta_1", "of": "q", "value": -1.0, "stop": stop}
+    with optimization("-O0"):
+        exported = export(scene_of("five_bar").with_overrides({"event": [event]}), "fmu")
+    assert exported.differences == [f"the scene's events are left out{note}"]
+
+
 def test_command_writes_an_fmu(tmp_path: Path) -> None:
     result = ckc("export", "five_bar", "--to", "fmu", "--fmi", "3.0", "--unset", "controller", "--out", str(tmp_path))
     assert result.code == 0

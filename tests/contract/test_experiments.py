@@ -33,7 +33,7 @@ PARTS = {
 HAS_OUT = {"paper", "ensembles"}
 NOT_RUN = {
     "map", "scenes", "stream", "allocations", "robots", "pictures", "benchmark", "bench_ensembles", "iftomm",
-    "right_hand_sides", "time_optimal", "importers",
+    "right_hand_sides", "time_optimal", "importers", "exported_code",
 }  # fmt: skip
 
 

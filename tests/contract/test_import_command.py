@@ -78,7 +78,7 @@ def test_existing_files_are_kept_without_overwrite(folder: Path) -> None:
     refused = ckc("import", "linkage.xml")
     assert refused.code == 2
     files = ("mechanism.toml", "linkage.urdf", "default.scene.toml")
-    assert f"{' and '.join(f'linkage/{name}' for name in files)}: there already" in refused.err
+    assert f"{', '.join(f'linkage/{name}' for name in files)}: there already" in refused.err
     assert "--overwrite" in refused.err
     assert file.read_text(encoding="utf-8") == "mine"
     assert ckc("import", "linkage.xml", "--overwrite").code == 0

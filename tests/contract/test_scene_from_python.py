@@ -143,6 +143,8 @@ def test_scene_takes_names_of_mechanisms(name: str, tmp_path: Path) -> None:
     assert simulate(scene).mechanism.sources.folder == load(name).sources.folder
     with pytest.raises(InputError, match="'five_bar/swing' is a scene; its mechanism is 'five_bar'"):
         Scene("five_bar/swing", t_end=1.0)
+    with pytest.raises(InputError, match=r"default.scene.toml: a scene; expected a mechanism"):
+        load(scene.save(tmp_path / "again"))
 
 
 def test_mechanisms_from_python_use_the_compiled_terms_of_their_files(

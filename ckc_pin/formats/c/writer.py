@@ -29,11 +29,12 @@ __all__ = ["TEMPLATES", "fill_templates", "make_prefix", "require_exportable", "
 
 TEMPLATES = Path(__file__).parent / "templates"  # `mech` and `MECH` in names and texts are replaced by the prefix
 FRAME_BYTES = 256  # of a call: return address, saved registers, parameters, loop counters
-# Names of headers of C99, of `main.c` and of CMake's targets, which a prefix must not take.
+# Names of headers of C99, of `main.c`, of CMake's targets and of an FMU's sources, which a prefix must not take.
 RESERVED_PREFIXES = {
     "assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math", "setjmp",
     "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time", "wchar", "wctype",
     "features", "main", "all", "clean", "help", "install", "package", "test", "c", "m", "t",
+    "fmu", "fmi2", "fmi3", "stops", "directional_derivatives", "co_simulation",
 }  # fmt: skip
 
 
@@ -115,15 +116,14 @@ def require_exportable(mechanism: Mechanism, where: str) -> None:
     if rough:
         raise InputError(
             f"{where}: dry friction of {', '.join(rough)} is not supported, since sticking needs events; set "
-            "friction = 0, and add friction as a force outside of the exported code"
+            f"friction = 0 (--set joint.{rough[0]}.friction=0), and add friction as a force outside of the code"
         )
     if mechanism.d == 0:
         raise InputError(f"{where}: the mechanism has no freedom, so there is nothing to control")
-    roots = [*mechanism.independent_root_coordinates, *(["a free root"] if mechanism.splits_root else [])]
-    if roots:
+    if roots := mechanism.independent_root_coordinates:
         raise InputError(
-            f"{where}: the independent coordinates must be joints, but {', '.join(roots)} belongs to a free root; name "
-            "joints as independent, if the loops allow it"
+            f"{where}: independent coordinates of a free root ({', '.join(roots)}) are not supported; name joints as "
+            "independent, if the loops allow it"
         )
 
 

@@ -27,6 +27,7 @@ from ckc_pin.formats.fmu.model_description import build_description, describe_mo
 from ckc_pin.formats.fmu.variables import list_stops, list_variables, to_xml_name
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.scene.initial import Start, find_start
+from ckc_pin.scene.names import shorten_scene_name
 from ckc_pin.scene.parts import load_scene_mechanism
 from ckc_pin.scene.scene import Scene
 
@@ -34,6 +35,7 @@ __all__ = ["FMI_VERSIONS", "to_fmu"]
 
 FMI_VERSIONS = ("2.0", "3.0")
 TEMPLATES = Path(__file__).parent / "templates"
+INCLUDED = ("fmu.c", "stops.c", "directional_derivatives.c", "co_simulation.c")  # by the source of either version
 SYSTEMS = {"Linux": ("linux", ".so"), "Darwin": ("darwin", ".dylib")}
 MACHINES = {"AMD64": "x86_64", "arm64": "aarch64"}
 ZERO_ACCELERATION = 1e-10  # rad/s^2, or sizes of the mechanism per s^2: smaller forces of stops count as zero
@@ -61,7 +63,8 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     _require_plant(scene, mechanism, where)
     require_exportable(mechanism, where)
     start = find_start(mechanism, scene)
-    stem = re.sub(r"[^\w.-]+", "_", scene.name)
+    name = shorten_scene_name(scene.name)
+    stem = re.sub(r"[^\w.-]+", "_", name)
     prefix, spec = make_prefix(stem), scene.spec
     epsilon = spec.epsilon if spec.formulation == "spf" else None
     variables, renamed = list_variables(mechanism, start.at.q_tree, start.q_dot, epsilon)
@@ -74,7 +77,7 @@ def to_fmu(scene: Scene, fmi: str = "2.0") -> tuple[dict[str, str | bytes], list
     tool = f"ckc_pin {version('ckc_pin')}"
     entries: dict[str, str | bytes] = {
         "modelDescription.xml": describe_model(
-            fmi, to_xml_name(scene.name), prefix, identity, tool, variables, experiment, source
+            fmi, to_xml_name(name), prefix, identity, tool, variables, experiment, source
         ),
         **{f"sources/{name}": content for name, content in sources.items()},
     }
@@ -102,14 +105,18 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
             "it (--unset controller), and control the FMU in the importer, for example with the C code of --to c"
         )
     if spec.prescribed:
-        raise InputError(f"{where}: prescribed joints are not supported; remove prescribed, and give forces as inputs")
+        raise InputError(
+            f"{where}: prescribed joints are not supported; remove them (--unset prescribed), and use motor torques as "
+            "inputs"
+        )
     if spec.force or scene.forces:
         names = ", ".join(str(force.frame) for force in spec.force) or "Python functions"
         raise InputError(
-            f"{where}: forces on links ({names}) are not supported; remove them, and use the inputs force.COORDINATE"
+            f"{where}: forces on links ({names}) are not supported; remove them (--unset force), and use the inputs "
+            "force.COORDINATE"
         )
     if spec.initial.w is not None and np.any(spec.initial.w):
-        raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it")
+        raise InputError(f"{where}: initial.w: an FMU starts with closed loops; remove it (--unset initial.w)")
     if spec.formulation == "spf" and mechanism.tree.free_roots:
         raise InputError(
             f"{where}: model exchange by the SPF is not supported for free roots, whose quaternions need length 1; "
@@ -119,8 +126,9 @@ def _require_plant(scene: Scene, mechanism: Mechanism, where: str) -> None:
 
 def _describe_differences(scene: Scene) -> list[str]:
     notes = []
-    if scene.spec.event or scene.events:
-        notes.append("the scene's events are left out")
+    if events := [*scene.spec.event, *scene.events]:
+        stops = any(event.stop for event in events)
+        notes.append(f"the scene's events are left out{': the FMU goes on where a run stops' if stops else ''}")
     if scene.spec.work:
         notes.append("work is left out")
     if scene.spec.formulation == "spf":
@@ -131,8 +139,8 @@ def _describe_differences(scene: Scene) -> list[str]:
 def _write_sources(
     mechanism: Mechanism, prefix: str, source: str, start: Start, epsilon: float | None, rtol: float
 ) -> dict[str, str]:
-    names = {C_TEMPLATES: ("mech.c", "mech.h"), TEMPLATES: ("fmu.c", "stops.c", source)}
-    texts = {name: (folder / name).read_text(encoding="ascii") for folder, members in names.items() for name in members}
+    paths = [C_TEMPLATES / "mech.c", C_TEMPLATES / "mech.h", *(TEMPLATES / name for name in (*INCLUDED, source))]
+    texts = {path.name: path.read_text(encoding="ascii") for path in paths}
     stops, tree = list_stops(mechanism), mechanism.tree
     inertia = np.diag(Terms(mechanism, start.at, np.zeros(mechanism.n)).D_tree) * tree.step_scale
     more = {
@@ -150,10 +158,10 @@ def _write_sources(
         "START_RATES": initializer(start.q_dot),
         "STATE": initializer(sorted(mechanism.partition.q.tolist())),
         "STAGES": str(len(DOP853.B)),
-        "A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
-        "B": initializer(DOP853.B),
-        "E3": initializer(DOP853.E3),
-        "E5": initializer(DOP853.E5),
+        "DOP853_A": _matrix(DOP853.A[: len(DOP853.B), : len(DOP853.B)]),
+        "DOP853_B": initializer(DOP853.B),
+        "DOP853_E3": initializer(DOP853.E3),
+        "DOP853_E5": initializer(DOP853.E5),
     }
     return fill_templates(mechanism, prefix, texts, more, derivatives=True)
 

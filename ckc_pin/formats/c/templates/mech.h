@@ -1,5 +1,18 @@
 /* @TITLE@: dynamics and control of a closed kinematic chain in C99.
-   Written by ckc_pin @VERSION@ (ckc export --to c). Equations are numbered as in docs/paper.md of ckc_pin.
+   Written by ckc_pin @VERSION@ (ckc export --to c).
+
+   The coordinates q_tree (q') describe the tree, in which every loop is cut open; v_tree (v') are their rates. The loops
+   are closed where phi(q') = 0. Then the independent coordinates q determine the dependent ones z, and v' = rho q_dot.
+   Equations have the numbers of the paper that ckc_pin implements:
+     eq. 1:   D' dv'/dt + C' v' + h' = u_tree + J^T multipliers, with phi(q') = 0 and J = d phi / d q'
+     eq. 4:   sigma(q): the configuration q' with closed loops that belongs to q
+     eq. 6:   D q_ddot + C q_dot + h = u, with D = rho^T D' rho
+     eq. 14:  u = h(q_d) - K_P (q - q_d) - K_V q_dot
+     eq. 16:  u = D dv/dt + C v + h - K_D (q_dot - v), with v = q_d_dot - Lambda (q - q_d)
+   Gravity, springs and constant forces belong to h. Forces of dampers act in addition to u_tree and u.
+
+   Use: call mech_set_parameters, mech_configure with mech_assembled, and mech_move to the measured q.
+   Then call mech_tracking_step or mech_set_point_step once a sample, as main.c does.
 
    No heap, no writable globals, no recursion, no library but libm. Every loop has a fixed bound.
    Stack: at most MECH_STACK_BYTES, with all variables in memory as without optimization.
@@ -41,11 +54,11 @@ enum { @Q_PLACES@ };
 @TAU_PLACES@
 typedef enum {
   MECH_OK = 0,
-  MECH_NOT_CLOSED,  /* the loops cannot be closed near the guess: q is out of reach or too far from the guess */
-  MECH_SINGULAR,    /* phi_z is singular: q does not determine the configuration */
-  MECH_NOT_FINITE,  /* an argument or a result is not a finite number */
-  MECH_INACCURATE,  /* elimination lost more than four digits; mech_forward_dynamics does not use it */
-  MECH_UNDRIVEN     /* the motors cannot produce every u */
+  MECH_NOT_CLOSED, /* the loops cannot be closed near the guess: q is out of reach or too far from the guess */
+  MECH_SINGULAR, /* phi_z is singular: q does not determine the configuration */
+  MECH_NOT_FINITE, /* an argument or a result is not a finite number */
+  MECH_INACCURATE, /* mech_acceleration lost more than four digits; use mech_forward_dynamics */
+  MECH_UNDRIVEN /* the motors cannot produce every u */
 } mech_status;
 
 /* Parameters of the mechanism, with the names that ckc_pin uses.
@@ -64,13 +77,13 @@ typedef struct {
 
 /* A configuration with the terms of its loops, eqs. 1 to 5. */
 typedef struct {
-  double q_tree[MECH_NQ];                             /* q' */
-  double trig[2 * MECH_NQ];                           /* cosines and sines of q' */
-  double phi[MECH_SIZE(MECH_ROWS)];                   /* residual of the loops */
-  double J[MECH_SIZE(MECH_ROWS * MECH_N)];            /* d phi / d q', (MECH_ROWS, MECH_N) */
-  double phi_z[MECH_SIZE(MECH_Z * MECH_Z)];           /* factorized */
+  double q_tree[MECH_NQ]; /* q' */
+  double trig[2 * MECH_NQ]; /* cosines and sines of q' */
+  double phi[MECH_SIZE(MECH_ROWS)]; /* residual of the loops */
+  double J[MECH_SIZE(MECH_ROWS * MECH_N)]; /* d phi / d q', (MECH_ROWS, MECH_N) */
+  double phi_z[MECH_SIZE(MECH_Z * MECH_Z)]; /* factorized */
   int pivot[MECH_SIZE(MECH_Z)];
-  double rho[MECH_N * MECH_D];                        /* v' = rho q_dot, (MECH_N, MECH_D) */
+  double rho[MECH_N * MECH_D]; /* v' = rho q_dot, (MECH_N, MECH_D) */
 #ifdef MECH_CHARTS
   int independent[MECH_D], dependent[MECH_SIZE(MECH_Z)]; /* places of q and z in v_tree, which an FMU changes */
 #endif
@@ -170,7 +183,7 @@ mech_status mech_advance(const mech_model *model, mech_motion *motion, const dou
 typedef struct {
   double q[MECH_D];
   double q_dot[MECH_D];
-  double q_d[MECH_D];      /* the desired motion at this instant; only mech_tracking_step reads it */
+  double q_d[MECH_D]; /* the desired motion at this instant; only mech_tracking_step reads it */
   double q_d_dot[MECH_D];
   double q_d_ddot[MECH_D];
 } mech_measurement;
