@@ -23,7 +23,7 @@ from ckc_pin.optimization.limits import MotionLimits
 from ckc_pin.optimization.path import CoordinatePath, PathMotion, make_path
 from ckc_pin.optimization.plan import Plan, find_active, measure
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
-from ckc_pin.optimization.replay import JUMP_GAP, replay_plan
+from ckc_pin.optimization.replay import JUMP_GAP, REPLAY_ERROR, replay_plan, replay_warnings, require_replayed
 from ckc_pin.optimization.smooth_profile import optimize_profile
 from ckc_pin.optimization.spec import OptimizeSpec, PathSpec, StateSpec
 from ckc_pin.optimization.speed_profile import SpeedProfile
@@ -39,8 +39,9 @@ DIVISION = 4  # parts of an interval inside which a limit is exceeded
 MIN_SPACING = 1e-7  # of the points of the first grid
 LIMIT_TOLERANCE = 2e-5  # relative: limits are narrowed by it on the grid, and by half of it between its points
 FORCE_TOLERANCE = 1e-8  # relative to the largest force: what torques within limits may fail to produce
-TORQUE_TOLERANCE = 1e-6  # relative to the largest torque: error of linear interpolation between rows
-MAX_ROWS = 32  # of the torques' table in an interval
+# Tables of torques; another one follows if the replay misses the end. Errors of linear interpolation between rows,
+# relative to the largest torque, and the most rows in an interval.
+TABLES = ((1e-6, 32), (1e-8, 512))
 TIME_TOLERANCE = 1e-6  # relative, of limits.time
 INTERVAL_TIME_TOLERANCE = 1e-3  # of the duration: error of the time of an interval, above which it is divided
 DURATION_GUESS = 1.0  # s: of the initial guess if nothing limits the speed
@@ -62,16 +63,21 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
     path = make_path(table, mechanism) if table.shape != "free" else _find_free_path(dynamics, spec, table, limits)
     motion, iterations, parts = _refine_profile(dynamics, path, limits, spec)
     t_end = float(motion.corners[-1])
-    t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2))
+    for tolerance, rows in TABLES:
+        t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2), tolerance, rows)
+        replay = replay_plan(mechanism, dynamics, motion, at, t, torque)
+        if replay.error <= REPLAY_ERROR:
+            break
+    require_replayed(mechanism, replay, t_end)
     quantities, margin = measure(mechanism, dynamics, limits, at)
-    replay = replay_plan(mechanism, dynamics, motion, at, t, torque)
     return Plan(
         mechanism=mechanism, status="solved", t_end=t_end,
         message="the fastest motion along the path" if _is_fastest(spec, limits) else "a local optimum along the path",
         cost=sum(getattr(spec.minimize, name) * x for name, x in parts.items()), parts=parts, iterations=iterations,
         coordinates=mechanism.independent, motion=motion, torque_t=t, torque=torque, t=t,
         quantities=quantities, margin=margin, limits=limits,
-        active=tuple(find_active(limits, t, quantities, margin)), replay=replay, warnings=path.warnings,
+        active=tuple(find_active(limits, t, quantities, margin)), replay=replay,
+        warnings=(*path.warnings, *replay_warnings(mechanism, replay)),
     )  # fmt: skip
 
 
@@ -235,7 +241,7 @@ def _instants(
 
 
 def _torque_table(
-    dynamics: ReducedDynamics, motion: PathMotion, limits: MotionLimits
+    dynamics: ReducedDynamics, motion: PathMotion, limits: MotionLimits, tolerance: float, max_rows: int
 ) -> tuple[Array, MotionInstants, Array]:
     """Return times, instants and motor torques of a table that is interpolated linearly.
 
@@ -250,7 +256,7 @@ def _torque_table(
     tau = _instants(dynamics, motion, three.ravel(), limits)[0].tau.reshape(*three.shape, -1)
     bend = tau[:, [0, 2]].mean(axis=1) - tau[:, 1]
     size = np.abs(bend).max(axis=1) / np.abs(tau).max()
-    parts = np.clip(np.ceil(np.sqrt(size / TORQUE_TOLERANCE)), 1, MAX_ROWS).astype(int)
+    parts = np.clip(np.ceil(np.sqrt(size / tolerance)), 1, max_rows).astype(int)
     t = np.concatenate([np.linspace(a, b, n + 1) for a, b, n in zip(begin, end, parts, strict=True)])
     instants, _ = _instants(dynamics, motion, t, limits)
     correction = np.repeat(2 / 3 * bend / parts[:, None] ** 2, parts + 1, axis=0)

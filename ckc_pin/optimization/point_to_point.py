@@ -24,7 +24,7 @@ from ckc_pin.optimization.mesh_motion import Guess, Mesh, Solution, times
 from ckc_pin.optimization.phase_dynamics import PhaseDynamics
 from ckc_pin.optimization.plan import Plan, find_active, measure
 from ckc_pin.optimization.reduced import ReducedDynamics
-from ckc_pin.optimization.replay import JUMP_GAP, Cycle, replay_plan
+from ckc_pin.optimization.replay import JUMP_GAP, REPLAY_ERROR, Cycle, replay_plan, replay_warnings, require_replayed
 from ckc_pin.optimization.route import Route
 from ckc_pin.optimization.spec import MinimizeSpec, OptimizeSpec
 
@@ -35,8 +35,6 @@ MAX_MESHES = 16
 MAX_DOUBLINGS = 3  # of all intervals, because the replay misses the end; others are where limits are exceeded
 MAX_ITERATIONS = 400  # of IPOPT on one mesh
 FEW_ITERATIONS = 100  # of it, where other initial guesses may be better
-REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
-MAX_REPLAY_ERROR = 1e-2  # the same units: a plan with a larger one fails
 SAMPLES_PER_INTERVAL = 5
 UNBOUNDED_FACTOR = 1.1  # shorter durations, relative to the smallest that the optimizer may choose, are unbounded
 EXCESS = 1e-3  # relative: intervals in which a limit is exceeded by more are divided
@@ -111,7 +109,8 @@ def _plan_from(
         halves = misses and not friction.is_present and doublings < MAX_DOUBLINGS
         moves = friction.is_smoothed or (friction.is_present and misses)
         if not halves and not moves and not exceeded.intervals.any():
-            return _require_replayed(plan)
+            require_replayed(mechanism, plan.replay, plan.t_end)
+            return plan
         doublings += halves
         if exceeded.intervals.any() or halves:
             base = mesh.divide(exceeded.intervals | halves)
@@ -119,7 +118,8 @@ def _plan_from(
         motion, ends = solution.motion(), solution.values.ends
         torque = interpolation(solution.values.torque_t, solution.values.torque)
     if not exceeded.intervals.any():
-        return _require_replayed(plan)
+        require_replayed(mechanism, plan.replay, plan.t_end)
+        return plan
     raise NumericalError(
         f"optimize: budget: after {MAX_MESHES} meshes, {exceeded.name} still exceeds its limit by {exceeded.size:.1%} "
         "between the points of the mesh; give more intervals, or a wider limit"
@@ -171,16 +171,6 @@ def _require_durations(solution: Solution, guess: Guess, names: Sequence[str]) -
             f"optimize: unbounded: the motion from {names[k]} to {names[k + 1]} becomes arbitrarily short; give "
             "limits.rate, a weight of effort or another place"
         )
-
-
-def _require_replayed(plan: Plan) -> Plan:
-    """Raise NumericalError if a replay ends elsewhere. Dry friction has warnings instead, because joints may stick."""
-    if plan.replay.error > MAX_REPLAY_ERROR and not plan.mechanism.joints.friction.any():
-        raise NumericalError(
-            f"optimize: stuck: the replay of the plan misses its end by {plan.replay.error:.1e}: small errors grow "
-            f"during its {plan.t_end:.4g} s; give more intervals, limits.time or other limits"
-        )
-    return plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,12 +226,6 @@ def _assemble(
     cycle = None if route.places.turns is None else Cycle(route.places.turns)
     sections = route.sections(ends)
     replay = replay_plan(mechanism, dynamics, motion, at, torque_t, torque, cycle, sections)
-    warnings = []
-    if replay.error > REPLAY_ERROR:
-        remedy = "give more intervals"
-        if mechanism.joints.friction.any():
-            remedy = "joints with dry friction may stick, which the plan does not foresee; track the motion"
-        warnings.append(f"the replay misses the end by {replay.error:.1e}; {remedy}")
     at_rest = {"time": float(route.rests.sum()), "effort": float(route.rests @ (route.rest_torque**2).sum(axis=1))}
     solved = {name: x + at_rest.get(name, 0.0) for name, x in solution.parts.items()}
     plan = Plan(
@@ -249,7 +233,7 @@ def _assemble(
         cost=sum(getattr(minimize, name) * x for name, x in solved.items()), parts=solved, iterations=iterations,
         coordinates=dynamics.mechanism.independent, motion=motion, torque_t=torque_t, torque=torque, t=t,
         quantities=quantities, margin=margin, limits=limits, replay=replay,
-        active=tuple(find_active(limits, t, quantities, margin)), warnings=tuple(warnings),
+        active=tuple(find_active(limits, t, quantities, margin)), warnings=replay_warnings(mechanism, replay),
         crossings=find_crossings(mechanism, dynamics, motion, t, at, interpolation(torque_t, torque)),
         via_t=tuple((ends[1:-1] + route.offsets[1:] - route.rests[:-1]).tolist()), cycle=cycle, sections=sections,
     )  # fmt: skip

@@ -9,6 +9,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.control.piecewise import PiecewisePolynomial
+from ckc_pin.errors import NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.optimization.reduced import MotionInstants, ReducedDynamics
@@ -17,6 +18,7 @@ from ckc_pin.scene.scene import Scene
 
 __all__ = [
     "JUMP_GAP",
+    "REPLAY_ERROR",
     "CoordinateMotion",
     "Cycle",
     "Replay",
@@ -24,6 +26,8 @@ __all__ = [
     "cut",
     "make_scene",
     "replay_plan",
+    "replay_warnings",
+    "require_replayed",
     "torque_controller",
 ]
 
@@ -31,6 +35,8 @@ CUT_TOLERANCE = 1e-12  # of the duration, of the times at which a motion is cut
 PERIODS = 3  # of scenes of periodic motions
 REPLAY_TOLERANCE = 1e-11  # relative and absolute, of the step loop
 BRANCH_TOLERANCE = 1e-6  # rad, m: of coordinates on the branch of the assembled configuration
+REPLAY_ERROR = 1e-6  # rad, rad/s, m, m/s: of the replay at the end
+MAX_REPLAY_ERROR = 1e-2  # the same units: a plan with a larger one fails
 JUMP_GAP = 1e-7  # of the duration, between the rows at both sides of a jump of torques
 
 
@@ -163,6 +169,25 @@ def replay_plan(
     error = max(np.abs(numbers[q_at] - q[0]).max(), np.abs(rates[q_at] - q_dot[0]).max())
     closure = float(np.abs(dynamics.residual(at.q_tree)).max(initial=0.0))
     return Replay(float(error), max_tau, closure)
+
+
+def replay_warnings(mechanism: Mechanism, replay: Replay) -> tuple[str, ...]:
+    """Return a warning if a replay misses the end of its plan."""
+    if replay.error <= REPLAY_ERROR:
+        return ()
+    remedy = "give more intervals"
+    if mechanism.joints.friction.any():
+        remedy = "joints with dry friction may stick, which the plan does not foresee; track the motion"
+    return (f"the replay misses the end by {replay.error:.1e}; {remedy}",)
+
+
+def require_replayed(mechanism: Mechanism, replay: Replay, t_end: float) -> None:
+    """Raise NumericalError if a replay ends elsewhere. Dry friction has warnings instead, because joints may stick."""
+    if replay.error > MAX_REPLAY_ERROR and not mechanism.joints.friction.any():
+        raise NumericalError(
+            f"optimize: stuck: the replay of the plan misses its end by {replay.error:.1e}: small errors grow "
+            f"during its {t_end:.4g} s; give more intervals, limits.time or other limits"
+        )
 
 
 def cut(motion: CoordinateMotion, t: Array, torque: Array, section: Section) -> tuple[CoordinateMotion, Array, Array]:

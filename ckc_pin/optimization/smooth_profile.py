@@ -70,10 +70,18 @@ def optimize_profile(
                        {"print_time": False, "ipopt": make_settings(MAX_ITERATIONS, TOLERANCE)})  # fmt: skip
     result = solver(x0=problem.guess, lbx=problem.lower, ubx=problem.upper, lbg=bounds[0], ubg=bounds[1])
     stats = solver.stats()
+    status, iterations = stats["return_status"], stats["iter_count"]
+    if status == "Infeasible_Problem_Detected":
+        raise NumericalError("optimize: infeasible: no motion along the path fulfils all limits; raise them")
+    if status == "Maximum_Iterations_Exceeded":
+        raise NumericalError(
+            f"optimize: budget: no optimum along the path after {iterations} iterations; give other intervals, weights "
+            "or limits"
+        )
     if not stats["success"]:
         raise NumericalError(
-            f"optimize: stuck: IPOPT reports {stats['return_status']} after {stats['iter_count']} iterations along the "
-            "path; give other intervals, weights or limits"
+            f"optimize: stuck: IPOPT reports {status} after {iterations} iterations along the path; give other "
+            "intervals, weights or limits"
         )
     w = result["x"].full().ravel()
     values = cs.Function("parts", [problem.w], [*problem.parts.values(), problem.u, problem.b])(w)

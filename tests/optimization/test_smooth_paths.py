@@ -112,6 +112,19 @@ def test_smooth_motions_of_the_five_bar_are_replayed(minimize: dict[str, float],
         assert np.abs(plan.quantities[:, at]).max() < limits["power"] * (1 + 1e-4)
 
 
+def test_torques_of_a_path_with_rounded_corners_are_replayed() -> None:
+    """The table of torques gets finer until the replay ends with the plan."""
+    places = {
+        "arm_1": [0.3261, 0.2377, 0.4406, 0.1207], "arm_2": [0.5032, 0.3509, 0.1537, 0.5221],
+        "arm_3": [0.1031, 0.2893, 0.0899, 0.1237],
+    }  # fmt: skip
+    path = {"q": places, "shape": "lines", "rounding": 0.02}
+    plan = optimize("delta", path=path, minimize={"time": 0.135, "effort": 0.23}, limits={"torque": 8.0})
+    require_replay(plan, 8.0)
+    assert len(plan.warnings) == 1
+    assert "2 corners are rounded" in plan.warnings[0]
+
+
 def test_effort_lies_between_neighbouring_weights() -> None:
     """A larger weight never gives a longer optimum of its own part: costs are monotone in the weights."""
     plans = [optimize("five_bar", path=FIVE_BAR, minimize={"time": 1.0, "effort": w}, limits={"torque": 2.0})
