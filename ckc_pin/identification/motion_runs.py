@@ -16,8 +16,9 @@ from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.control.controllers import RecordedTorques
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_splines
+from ckc_pin.identification.measured_motion import estimate_start
 from ckc_pin.identification.records import Record, describe_missing, require_radians
+from ckc_pin.identification.splines import SplineFit, fit_splines
 from ckc_pin.identification.unknowns import LINK_VALUES, ParameterValue, Unknown, Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES
