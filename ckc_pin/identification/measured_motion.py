@@ -1,7 +1,7 @@
 """Configurations, rates and accelerations of the whole tree from measured coordinates.
 
-Each measured coordinate is fitted by a smoothing spline. The loops then give all coordinates: at each instant the
-configuration on the constraint manifold that is nearest to the splines, weighted by their noise. Rates and
+Each measured coordinate is fitted by a smooth function. The loops then give all coordinates: at each instant the
+configuration on the constraint manifold that is nearest to these functions, weighted by their noise. Rates and
 accelerations follow in the same sense.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
 from ckc_pin.errors import InputError
-from ckc_pin.identification.splines import SplineFit
+from ckc_pin.identification.smooth_fit import SmoothFit
 from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
@@ -103,13 +103,13 @@ def _all_coordinates(mechanism: Mechanism, q_tree: Array) -> Array:
     return np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
 
 
-def estimate_motion(mechanism: Mechanism, fits: Mapping[str, SplineFit], instants: Array) -> MeasuredMotion:
-    """Estimate the motion of all coordinates at instants from the splines of at least d coordinates.
+def estimate_motion(mechanism: Mechanism, fits: Mapping[str, SmoothFit], instants: Array) -> MeasuredMotion:
+    """Estimate the motion of all coordinates at instants from smooth functions fitted to at least d coordinates.
 
     Parameters
     ----------
     mechanism : Mechanism
-    fits : mapping of str to SplineFit
+    fits : mapping of str to SmoothFit
         By coordinate.
     instants : (m,) array
         Those at which some acceleration is extrapolated are left out.
@@ -125,10 +125,10 @@ def estimate_motion(mechanism: Mechanism, fits: Mapping[str, SplineFit], instant
     instants = instants[(instants >= first) & (instants <= last)]
     if not len(instants):
         raise InputError(
-            f"identify: no torque was measured from t = {first:.4g} to {last:.4g} s, where splines of "
+            f"identify: no torque was measured from t = {first:.4g} to {last:.4g} s, where smooth functions of "
             f"{', '.join(names)} give accelerations; record a longer motion"
         )
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
     here = nearest.start(measured[0, 0], names)
     few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
@@ -148,11 +148,11 @@ def estimate_motion(mechanism: Mechanism, fits: Mapping[str, SplineFit], instant
 
 
 def shift_motion(
-    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SplineFit], order: int, name: str, shift: float
+    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SmoothFit], order: int, name: str, shift: float
 ) -> MeasuredMotion:
-    """Return the motion with one spline (order 0), its rate (1) or its acceleration (2) shifted (InputError)."""
+    """Return the motion with one measured value (order 0), rate (1) or acceleration (2) shifted (InputError)."""
     at = mechanism.tree.indices(tuple(fits), "identify: data")
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     shifts = np.zeros((3, len(motion.t), len(fits)))
     shifts[order, :, list(fits).index(name)] = shift
     if order == 2:
@@ -166,8 +166,8 @@ def shift_motion(
     return replace(motion, q_tree=q_tree, v_tree=v_tree, a_tree=a_tree, rho=rho)
 
 
-def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
-    """Estimate all coordinates and the independent rates at one time from the splines of at least d coordinates.
+def estimate_start(mechanism: Mechanism, fits: Mapping[str, SmoothFit], t: float) -> tuple[Array, Array]:
+    """Estimate all coordinates and the independent rates at one time from functions fitted to at least d coordinates.
 
     Returns
     -------
@@ -182,15 +182,15 @@ def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float
         As of `estimate_motion`.
     """
     at = mechanism.tree.indices(tuple(fits), "identify: data")
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     numbers, rates, accelerations = np.array([fit.values(np.array([t]))[:, 0] for fit in fits.values()]).T
     here = nearest.start(numbers, list(fits))
     _, v_tree, _ = nearest.rates(here.q_tree[None], rates[None], accelerations[None])
     return mechanism.tree.to_coordinates(here.q_tree), v_tree[0, mechanism.partition.q]
 
 
-def _spline_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SplineFit]) -> Array:
-    """Return the standard deviations of splines, at least rounding errors."""
+def _fit_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SmoothFit]) -> Array:
+    """Return the standard deviations of fitted functions, at least rounding errors."""
     smallest = 1e-12 * mechanism.tree.step_scale[at]
     return np.maximum([fit.std[0] for fit in fits.values()], smallest)
 

@@ -16,7 +16,8 @@ from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, describe_missing, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
-from ckc_pin.identification.splines import SplineFit, fit_splines
+from ckc_pin.identification.smooth_fit import SmoothFit
+from ckc_pin.identification.smoothing import fit_record
 from ckc_pin.identification.structure import MotionAdvice
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -43,7 +44,7 @@ class _Equations:
     to_motors : (m, motors, d) array
         Torques that give generalized forces, least-squares.
     tau : (m, motors) array
-    fits : mapping of str to SplineFit
+    fits : mapping of str to SmoothFit
         By measured coordinate.
     """
 
@@ -53,7 +54,7 @@ class _Equations:
     right: Array
     to_motors: Array
     tau: Array
-    fits: Mapping[str, SplineFit]
+    fits: Mapping[str, SmoothFit]
 
 
 def identify_torques(
@@ -104,9 +105,9 @@ def _equations(
     record: Record,
     warnings: list[str],
     max_instants: int = MAX_INSTANTS,
-    fits: Mapping[str, SplineFit] | None = None,
+    fits: Mapping[str, SmoothFit] | None = None,
 ) -> _Equations:
-    """Estimate the motion of a record, from splines of its coordinates if they are known, and set up its equations."""
+    """Estimate the motion of a record, from fits of its coordinates if they are known, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     required = [*torques, *(mechanism.independent if len(names) < mechanism.d else ())]
@@ -115,7 +116,7 @@ def _equations(
         needed = f"{mechanism.d} coordinates and the torque of every motor"
         raise InputError(describe_missing(record, missing, needed))
     require_radians(mechanism, record, names)
-    fits = fit_splines(record, names) if fits is None else fits
+    fits = fit_record(record, names) if fits is None else fits
     tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
@@ -185,9 +186,9 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
 
 @dataclass(frozen=True, eq=False)
 class _MotionErrors:
-    """Errors of the equations of a record that errors of its splines cause.
+    """Errors of the equations of a record that errors of its fitted coordinates cause.
 
-    They are correlated over a knot interval, and may be too small beside the noise of torques to show in the residuals.
+    They are correlated over some instants, and may be too small beside the noise of torques to show in the residuals.
 
     Attributes
     ----------
@@ -197,7 +198,7 @@ class _MotionErrors:
 
     t: Array
     gains: Array
-    fits: Sequence[SplineFit]
+    fits: Sequence[SmoothFit]
     validation: bool
 
     @classmethod
@@ -238,8 +239,8 @@ class _MotionErrors:
             total += np.einsum("kic,kjc->ij", one, other) / len(first)
         return (total + total.T) / 2
 
-    def _at(self, at: Array, k: int, fit: SplineFit) -> Array:
-        """Return the errors (instants, d, any) that errors of one spline cause at some instants."""
+    def _at(self, at: Array, k: int, fit: SmoothFit) -> Array:
+        """Return the errors (instants, d, any) that errors of one coordinate cause at some instants."""
         gains = self.gains[..., k][:, at]
         apart = np.einsum("okd,kl->okld", gains, np.eye(len(at))).reshape(3, len(at), -1)
         return fit.errors(self.t[at], apart).reshape(len(at), gains.shape[2], -1)

@@ -331,7 +331,9 @@ def test_bad_parameters_and_short_or_saturated_data_have_one_message():
         identify("five_bar", few, PARAMETERS)
     early = record("five_bar", 1e-4)
     early["tau.theta_1"][10:] = np.nan
-    with pytest.raises(InputError, match=r"no torque was measured from t = .* splines of theta_1, theta_3 give"):
+    with pytest.raises(
+        InputError, match=r"no torque was measured from t = .* smooth functions of theta_1, theta_3 give"
+    ):
         identify("five_bar", early, PARAMETERS)
     off = record("five_bar")
     off["theta_1"] = off["theta_1"] + 3.0
