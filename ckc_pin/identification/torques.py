@@ -129,15 +129,16 @@ def _equations(
             f"identify: {record.source}: {torques[k]} is at its limit, {limit[0, k]:.4g} to {limit[1, k]:.4g}, most of "
             "the time, and may be wrong there; record a slower motion, or correct torque_limit"
         )
+    source = f"{record.source} (validation)" if record.validation else record.source
     if saturated.any():
-        warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
+        warnings.append(f"{source}: {saturated.sum()} instants with a motor at its torque limit are left out")
     at = np.flatnonzero(used & ~saturated)
     at = at[:: max(1, -(-len(at) // max_instants))]
     motion = estimate_motion(mechanism, fits, times[at])
     reversals = motion.near_reversals(regressor.has_friction)
     if reversals.any():
         warnings.append(
-            f"{record.source}: {reversals.sum()} instants near reversals are left out, where the direction of friction "
+            f"{source}: {reversals.sum()} instants near reversals are left out, where the direction of friction "
             "is uncertain"
         )
         motion = motion.at(~reversals)
