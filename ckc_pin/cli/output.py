@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -166,6 +165,8 @@ def make_folder(out: Path, option: str = "--out ") -> None:
     InputError
         The folder cannot be written to. `option` is the command's name of it.
     """
+    import tempfile
+
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()

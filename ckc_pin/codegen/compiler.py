@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import signal
-import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,11 +13,15 @@ from hashlib import sha256
 from pathlib import Path
 from threading import Event
 from time import monotonic
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from ckc_pin.base.interrupt import uninterrupted_thread
 from ckc_pin.errors import InputError
+
+if TYPE_CHECKING:
+    import subprocess
 
 __all__ = ["FLAGS", "Compiler", "compile_c", "find_compiler", "hash_of", "run_program"]
 
@@ -132,6 +135,8 @@ def run_program(command: Sequence[str], timeout_s: float, temporary: Path) -> su
 
 
 def _run(command: Sequence[str], timeout_s: float, temporary: Path, stop: Event) -> subprocess.CompletedProcess[str]:
+    import subprocess
+
     deadline = monotonic() + timeout_s
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",

@@ -38,7 +38,7 @@ def identify(
 
     With ``method="torques"``, eq. 1 along the motions that the loops allow is linear in inertias, friction, damping,
     rotor inertias, stiffnesses and offsets. The other coordinates, rates and accelerations follow from the loops and
-    from splines of what was measured.
+    from smooth functions fitted to what was measured.
 
     With ``method="motion"``, runs with the measured torques are fitted to what was measured. Any parameter that
     `sensitivities` takes can be estimated, and the start of each record is estimated too.

@@ -1,9 +1,7 @@
 """Configurations, rates and accelerations of the whole tree from measured coordinates.
 
-Each measured coordinate is fitted by a spline of degree seven. Generalized cross-validation chooses its number of
-knots, and a quarter more are taken: the number that is best for values leaves a smoothing error of the accelerations,
-as large as that of noise, which no standard deviation includes. The loops then give all coordinates: at each instant
-the configuration on the constraint manifold that is nearest to the splines, weighted by their noise. Rates and
+Each measured coordinate is fitted by a smooth function. The loops then give all coordinates: at each instant the
+configuration on the constraint manifold that is nearest to these functions, weighted by their noise. Rates and
 accelerations follow in the same sense.
 """
 
@@ -15,21 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, Immutable
+from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
 from ckc_pin.errors import InputError
-from ckc_pin.identification.records import Record
+from ckc_pin.identification.smooth_fit import SmoothFit
 from ckc_pin.mechanism.batch import evaluate_closure, integrate_many
 from ckc_pin.mechanism.configuration import Kinematics
 from ckc_pin.mechanism.mechanism import Mechanism
 
-__all__ = ["MeasuredMotion", "SplineFit", "close_many", "estimate_motion", "estimate_start", "fit_splines",
-           "motion_along", "shift_motion"]  # fmt: skip
+__all__ = ["MeasuredMotion", "close_many", "estimate_motion", "estimate_start", "motion_along", "shift_motion"]
 
-DEGREE = 7
-KNOT_GROWTH = 1.25  # between numbers of knots that are compared
-MORE_KNOTS = 1.25  # times those of cross-validation
-MIN_SAMPLES_PER_KNOT = 3.0
-EDGE = 1.5  # knot intervals at each end that are left out, where accelerations are extrapolated
 MAX_ITERATIONS, MAX_START_STEPS = 20, 1600
 MAX_FOLLOWED = 400  # instants that are followed one after the other; the others are interpolated between them first
 GUESS_STEP = 1e-3  # size of the last Gauss-Newton step of configurations that initial guesses are interpolated between
@@ -38,6 +30,8 @@ OFF_BRANCH = (
     "the loops do not let the mechanism follow the measured coordinates; they are of another branch (q_guess in the "
     "mechanism's file chooses it) or another mechanism, have an offset, or are in other units"
 )
+CERTAIN = 3.0  # rate in standard deviations from which its sign is known
+MAX_UNCERTAIN = 0.1  # share of the instants at which the sign of a moving joint is not
 FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
 
 
@@ -71,119 +65,18 @@ class MeasuredMotion(Immutable):
         width = np.where(uncertain, np.sqrt(2.0) * self.v_std, 1.0)
         return np.where(uncertain, erf(self.v_tree / width), np.sign(self.v_tree))
 
+    def near_reversals(self, joints: BoolArray) -> BoolArray:
+        """Return whether the direction of one of these joints, (n,) booleans, is uncertain at each instant, (m,).
 
-@dataclass(frozen=True, eq=False)
-class SplineFit(Immutable):
-    """A spline fitted to one measured quantity.
-
-    Attributes
-    ----------
-    noise : float
-        Standard deviation of a measurement, given or estimated.
-    std : (3,) array
-        Standard deviations of the spline, its rate and its acceleration in the interior, root mean squares.
-    interval : float
-        Distance of two knots, s.
-    factor : (DEGREE + 1, coefficients) array
-        Cholesky factor of the normal equations, as a band.
-    """
-
-    spline: Any
-    noise: float
-    std: Array
-    interval: float
-    factor: Array
-
-    def values(self, t: Array) -> Array:
-        """Return value, rate and acceleration, shape (3, len(t))."""
-        return np.array([self.spline(t), self.spline.derivative(1)(t), self.spline.derivative(2)(t)])
-
-    def errors(self, t: Array, gains: Array) -> Array:
-        """Return errors of sums of gains (3, m, r) times value, rate and acceleration at times (m,).
-
-        Returns
-        -------
-        (r, coefficients) array
-            Factors of independent errors of variance 1.
+        A joint that hardly moves does not count. Its direction is uncertain all the time.
         """
-        from scipy.interpolate import BSpline
-        from scipy.linalg import solve_banded
+        uncertain = (np.abs(self.v_tree) < CERTAIN * self.v_std) & joints
+        return np.asarray(uncertain[:, uncertain.mean(axis=0) <= MAX_UNCERTAIN].any(axis=1))
 
-        sums = np.zeros((gains.shape[2], len(self.spline.c)))
-        for k, gain in enumerate(gains):
-            by_coefficient = BSpline(self.spline.t, np.eye(len(self.spline.c)), DEGREE).derivative(k)
-            design = BSpline.design_matrix(t, by_coefficient.t, DEGREE - k)
-            sums += (gain.T @ design) @ by_coefficient.c[: design.shape[1]]
-        lower = np.array([np.roll(row, -k) for k, row in enumerate(self.factor[::-1])])  # the transposed factor
-        return self.noise * solve_banded((DEGREE, 0), lower, sums.T).T
-
-
-def fit_splines(record: Record, names: Sequence[str]) -> dict[str, SplineFit]:
-    """Fit splines to measured quantities of a record (InputError)."""
-    return {
-        name: fit_spline(f"{record.source}: {name}", record.times(name), record.values[name], record.noise.get(name))
-        for name in names
-    }
-
-
-def fit_spline(name: str, t: Array, y: Array, noise: float | None = None) -> SplineFit:
-    """Fit a spline to measurements y at increasing times t, which may be unequal; NaN marks gaps.
-
-    Messages call the quantity `name`.
-
-    Raises
-    ------
-    InputError
-        Fewer than sixteen measurements.
-    """
-    measured = np.isfinite(y)
-    t, y = t[measured], y[measured]
-    if len(t) < 2 * (DEGREE + 1):
-        raise InputError(f"identify: {name}: {len(t)} values; at least {2 * (DEGREE + 1)} are needed")
-    best, lowest = 2, np.inf
-    count, worse, max_count = 2.0, 0, len(t) / MIN_SAMPLES_PER_KNOT - DEGREE
-    while count <= max_count and worse <= 8:
-        spline, size = _least_squares(t, y, int(count))
-        score = float(np.mean((y - spline(t)) ** 2)) / (1 - size / len(t)) ** 2
-        worse = 0 if score < lowest else worse + 1
-        if not worse:
-            best, lowest = int(count), score
-        count = max(count + 1, count * KNOT_GROWTH)
-    spline, size = _least_squares(t, y, max(2, int(min(MORE_KNOTS * best, max_count))))
-    if noise is None:
-        noise = float(np.sqrt(np.sum((y - spline(t)) ** 2) / max(len(t) - size, 1)))
-    interval = (t[-1] - t[0]) / (size - DEGREE)
-    std, factor = _spline_std(spline, t)
-    return SplineFit(spline, noise, noise * std, float(interval), factor)
-
-
-def _least_squares(t: Array, y: Array, intervals: int) -> tuple[Any, int]:
-    """Return the spline whose knot intervals have equally many measurements, and its number of coefficients."""
-    from scipy.interpolate import make_lsq_spline
-
-    inner = np.quantile(t, np.linspace(0, 1, intervals + 1)[1:-1])
-    knots = np.concatenate([[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)])
-    return make_lsq_spline(t, y, knots, k=DEGREE), intervals + DEGREE
-
-
-def _spline_std(spline: Any, t: Array) -> tuple[Array, Array]:
-    """Return the standard deviations of `SplineFit` for unit noise, and its factor."""
-    from scipy.interpolate import BSpline
-    from scipy.linalg import cho_solve_banded, cholesky_banded
-
-    knots = spline.t
-    design = BSpline.design_matrix(t, knots, DEGREE)
-    gram = (design.T @ design).tocsc()
-    size = gram.shape[0]
-    band = np.zeros((DEGREE + 1, size))
-    for k in range(DEGREE + 1):
-        band[DEGREE - k, k:] = gram.diagonal(k)
-    factor = cholesky_banded(band)
-    at = np.linspace(t[0], t[-1], 25)[2:-2]
-    unit = BSpline(knots, np.eye(size), DEGREE)
-    rows = [unit(at), unit.derivative(1)(at), unit.derivative(2)(at)]
-    std = np.sqrt([np.mean(np.sum(x.T * cho_solve_banded((factor, False), x.T), axis=0)) for x in rows])
-    return std, factor
+    def at(self, instants: IntArray | BoolArray) -> MeasuredMotion:
+        """Return the motion at some of its instants, given by index or as booleans."""
+        arrays = {key: getattr(self, key)[instants] for key in ("t", "q_tree", "v_tree", "a_tree", "rho")}
+        return replace(self, **arrays)
 
 
 def close_many(mechanism: Mechanism, q_tree: Array, q: Array) -> Array:
@@ -210,18 +103,16 @@ def _all_coordinates(mechanism: Mechanism, q_tree: Array) -> Array:
     return np.array([mechanism.tree.to_coordinates(one) for one in q_tree])
 
 
-def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit], instants: Array) -> MeasuredMotion:
-    """Estimate the motion of all coordinates at instants from the splines of at least d coordinates.
+def estimate_motion(mechanism: Mechanism, fits: Mapping[str, SmoothFit], instants: Array) -> MeasuredMotion:
+    """Estimate the motion of all coordinates at instants from smooth functions fitted to at least d coordinates.
 
     Parameters
     ----------
     mechanism : Mechanism
-    t : (2,) array
-        First and last measurement, s.
-    fits : mapping of str to SplineFit
+    fits : mapping of str to SmoothFit
         By coordinate.
     instants : (m,) array
-        Those closer to an end than a knot interval and a half are left out.
+        Those at which some acceleration is extrapolated are left out.
 
     Raises
     ------
@@ -230,14 +121,14 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
     """
     tree, names = mechanism.tree, list(fits)
     at = tree.indices(tuple(names), "identify: data")
-    margin = EDGE * max(fit.interval for fit in fits.values())
-    instants = instants[(instants >= t[0] + margin) & (instants <= t[-1] - margin)]
+    first, last = (extreme([fit.span[k] for fit in fits.values()]) for k, extreme in enumerate((max, min)))
+    instants = instants[(instants >= first) & (instants <= last)]
     if not len(instants):
         raise InputError(
-            f"identify: the data last {t[-1] - t[0]:.3g} s, too short for splines of {', '.join(names)}, which need "
-            f"more than {2 * margin:.3g} s; record a longer motion"
+            f"identify: no torque was measured from t = {first:.4g} to {last:.4g} s, where smooth functions of "
+            f"{', '.join(names)} give accelerations; record a longer motion"
         )
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     measured = np.array([fit.values(instants) for fit in fits.values()]).transpose(1, 2, 0)  # (3, m, coordinates)
     here = nearest.start(measured[0, 0], names)
     few = np.unique(np.linspace(0, len(instants) - 1, MAX_FOLLOWED).astype(int))
@@ -257,11 +148,11 @@ def estimate_motion(mechanism: Mechanism, t: Array, fits: Mapping[str, SplineFit
 
 
 def shift_motion(
-    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SplineFit], order: int, name: str, shift: float
+    mechanism: Mechanism, motion: MeasuredMotion, fits: Mapping[str, SmoothFit], order: int, name: str, shift: float
 ) -> MeasuredMotion:
-    """Return the motion with one spline (order 0), its rate (1) or its acceleration (2) shifted (InputError)."""
+    """Return the motion with one measured value (order 0), rate (1) or acceleration (2) shifted (InputError)."""
     at = mechanism.tree.indices(tuple(fits), "identify: data")
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     shifts = np.zeros((3, len(motion.t), len(fits)))
     shifts[order, :, list(fits).index(name)] = shift
     if order == 2:
@@ -275,8 +166,8 @@ def shift_motion(
     return replace(motion, q_tree=q_tree, v_tree=v_tree, a_tree=a_tree, rho=rho)
 
 
-def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float) -> tuple[Array, Array]:
-    """Estimate all coordinates and the independent rates at one time from the splines of at least d coordinates.
+def estimate_start(mechanism: Mechanism, fits: Mapping[str, SmoothFit], t: float) -> tuple[Array, Array]:
+    """Estimate all coordinates and the independent rates at one time from functions fitted to at least d coordinates.
 
     Returns
     -------
@@ -291,15 +182,15 @@ def estimate_start(mechanism: Mechanism, fits: Mapping[str, SplineFit], t: float
         As of `estimate_motion`.
     """
     at = mechanism.tree.indices(tuple(fits), "identify: data")
-    nearest = _Nearest(mechanism, at, _spline_noise(mechanism, at, fits))
+    nearest = _Nearest(mechanism, at, _fit_noise(mechanism, at, fits))
     numbers, rates, accelerations = np.array([fit.values(np.array([t]))[:, 0] for fit in fits.values()]).T
     here = nearest.start(numbers, list(fits))
     _, v_tree, _ = nearest.rates(here.q_tree[None], rates[None], accelerations[None])
     return mechanism.tree.to_coordinates(here.q_tree), v_tree[0, mechanism.partition.q]
 
 
-def _spline_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SplineFit]) -> Array:
-    """Return the standard deviations of splines, at least rounding errors."""
+def _fit_noise(mechanism: Mechanism, at: Any, fits: Mapping[str, SmoothFit]) -> Array:
+    """Return the standard deviations of fitted functions, at least rounding errors."""
     smallest = 1e-12 * mechanism.tree.step_scale[at]
     return np.maximum([fit.std[0] for fit in fits.values()], smallest)
 

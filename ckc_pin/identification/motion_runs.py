@@ -16,8 +16,10 @@ from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
 from ckc_pin.control.controllers import RecordedTorques
 from ckc_pin.errors import CkcError, InputError
-from ckc_pin.identification.measured_motion import SplineFit, estimate_start, fit_splines
+from ckc_pin.identification.measured_motion import estimate_start
 from ckc_pin.identification.records import Record, describe_missing, require_radians
+from ckc_pin.identification.smooth_fit import SmoothFit
+from ckc_pin.identification.smoothing import fit_record
 from ckc_pin.identification.unknowns import LINK_VALUES, ParameterValue, Unknown, Unknowns
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameters import AXES
@@ -55,7 +57,7 @@ class RecordedMotion(Immutable):
     controller : RecordedTorques or None
     q, q_dot : (n,) and (d,) arrays
         First guess of the start.
-    splines : mapping of str to SplineFit
+    fits : mapping of str to SmoothFit
         Of the coordinates that gave it.
     """
 
@@ -66,7 +68,7 @@ class RecordedMotion(Immutable):
     controller: RecordedTorques | None
     q: Array
     q_dot: Array
-    splines: Mapping[str, SplineFit]
+    fits: Mapping[str, SmoothFit]
 
     def until(self, part: float) -> RecordedMotion:
         """Return the first part of the record."""
@@ -151,10 +153,10 @@ def read_motion(mechanism: Mechanism, record: Record, warnings: list[str]) -> Re
         at = mechanism.tree.indices(tuple(coordinates), "identify: data")
         order, _ = pivoted_columns(mechanism.assembled.rho[at].T)
         chosen = [coordinates[k] for k in np.sort(order[: mechanism.d])]
-    splines = fit_splines(record, chosen)
-    q, q_dot = estimate_start(mechanism, splines, first)
+    fits = fit_record(record, chosen)
+    q, q_dot = estimate_start(mechanism, fits, first)
     controller = _interpolated(list(series.values()), first) if series else None
-    return RecordedMotion(record, names, t - first, values, controller, q, q_dot, splines)
+    return RecordedMotion(record, names, t - first, values, controller, q, q_dot, fits)
 
 
 def _measured(record: Record, name: str) -> tuple[Array, Array]:

@@ -56,7 +56,7 @@ PROMISING = 1e-3  # part of the cost by which the linear model says that it can 
 MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 HORIZONS = (0.1, 0.3)  # parts of the records that are fitted first, where runs from the start values leave the data
 LOST = 0.5  # residual of such runs, in standard deviations of the measurements over time
-SUSPICIOUS = 3.0  # residual in units of the noise of a quantity's spline
+SUSPICIOUS = 3.0  # residual in units of the noise of a quantity, by a smooth fit
 SUSPICIOUS_RMS = 1e-5  # rad or m: the smallest residual that is worth a warning
 
 
@@ -104,11 +104,11 @@ def identify_motion(
 
 
 def _misfits(prediction: Prediction, motion: RecordedMotion) -> Iterator[str]:
-    """Yield warnings about residuals that are much larger than the noise which the splines see."""
-    for name, spline in motion.splines.items():
+    """Yield warnings about residuals that are much larger than the noise by smooth fits."""
+    for name, smooth in motion.fits.items():
         k = prediction.quantities.index(name)
         rms = float(_rms(prediction.measured - prediction.predicted)[k])
-        noise = max(spline.noise, NOISE_FLOOR)
+        noise = max(smooth.noise, NOISE_FLOOR)
         if rms > SUSPICIOUS * noise and rms > SUSPICIOUS_RMS:
             yield (
                 f"{prediction.source}: the residual of {name} is {rms:.3g}, {rms / noise:.0f} times its noise; the "

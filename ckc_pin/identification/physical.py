@@ -21,7 +21,6 @@ from ckc_pin.identification.pseudo_inertia import basis
 
 __all__ = ["MIN_WEIGHT", "nearest_physical"]
 
-MAX_INFORMATION = 1e3  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
 MAX_INFORMATION = 1e6  # of measured directions, in inverse typical sizes; more only makes the problem ill-conditioned
 MIN_WEIGHT = 1e-2  # of the divergence: moves what is measured by less than 1e-2 of its standard deviation
 WEIGHTS = 10.0 ** np.arange(0.0, -2.1, -0.5)  # one after the other; larger ratios take many more Newton steps in all

@@ -50,6 +50,8 @@ class TorqueRegressor(Unknowns):
     Attributes
     ----------
     parameters : ParameterMap
+    has_friction : (n,) array of bool
+        Whether a joint has dry friction, given or unknown.
     """
 
     def __init__(self, mechanism: Mechanism, names: Sequence[str]) -> None:
@@ -65,6 +67,7 @@ class TorqueRegressor(Unknowns):
         for i, unknown in enumerate(self.unknowns):
             for key, slope in unknown.slopes.items():
                 self._slopes[key][i] = slope
+        self.has_friction = (mechanism.joints.friction != 0) | np.any(self._slopes.get("friction", 0.0), axis=0)
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shapes of the slopes that some unknown has, by key."""

@@ -11,17 +11,13 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import one_blas_thread
 from ckc_pin.errors import InputError
 from ckc_pin.identification.fit import fit_linear, no_prior
-from ckc_pin.identification.measured_motion import (
-    MeasuredMotion,
-    SplineFit,
-    estimate_motion,
-    fit_splines,
-    shift_motion,
-)
+from ckc_pin.identification.measured_motion import MeasuredMotion, estimate_motion, shift_motion
 from ckc_pin.identification.priors import make_prior
 from ckc_pin.identification.records import Record, describe_missing, require_radians
 from ckc_pin.identification.regressor import TorqueRegressor
 from ckc_pin.identification.result import Identification, Prediction, make_result
+from ckc_pin.identification.smooth_fit import SmoothFit
+from ckc_pin.identification.smoothing import fit_record
 from ckc_pin.identification.structure import MotionAdvice
 from ckc_pin.mechanism.mechanism import Mechanism
 
@@ -48,7 +44,7 @@ class _Equations:
     to_motors : (m, motors, d) array
         Torques that give generalized forces, least-squares.
     tau : (m, motors) array
-    fits : mapping of str to SplineFit
+    fits : mapping of str to SmoothFit
         By measured coordinate.
     """
 
@@ -58,7 +54,7 @@ class _Equations:
     right: Array
     to_motors: Array
     tau: Array
-    fits: Mapping[str, SplineFit]
+    fits: Mapping[str, SmoothFit]
 
 
 def identify_torques(
@@ -94,7 +90,7 @@ def identify_torques(
             step = regressor.nearest_physical(fit.x, fit.determined, fit.information)
         advice = MotionAdvice(regressor, fitted[0].motion.q_tree, regressor.names, has_torques=True)
     motions = [
-        _prediction(x, mechanism.motors.names, step, noise_of_torques, errors.covariance(0))
+        _prediction(x, mechanism.motors.names, step, noise_of_torques, errors.covariance(0), fit.covariance)
         for x, errors in zip(equations, errors_of_motion, strict=True)
     ]
     return make_result(
@@ -109,8 +105,9 @@ def _equations(
     record: Record,
     warnings: list[str],
     max_instants: int = MAX_INSTANTS,
+    fits: Mapping[str, SmoothFit] | None = None,
 ) -> _Equations:
-    """Estimate the motion of a record, and set up its equations."""
+    """Estimate the motion of a record, from fits of its coordinates if they are known, and set up its equations."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     required = [*torques, *(mechanism.independent if len(names) < mechanism.d else ())]
@@ -119,7 +116,7 @@ def _equations(
         needed = f"{mechanism.d} coordinates and the torque of every motor"
         raise InputError(describe_missing(record, missing, needed))
     require_radians(mechanism, record, names)
-    fits = fit_splines(record, names)
+    fits = fit_record(record, names) if fits is None else fits
     tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
@@ -132,12 +129,19 @@ def _equations(
             f"identify: {record.source}: {torques[k]} is at its limit, {limit[0, k]:.4g} to {limit[1, k]:.4g}, most of "
             "the time, and may be wrong there; record a slower motion, or correct torque_limit"
         )
+    source = f"{record.source} (validation)" if record.validation else record.source
     if saturated.any():
-        warnings.append(f"{record.source}: {saturated.sum()} instants with a motor at its torque limit are left out")
+        warnings.append(f"{source}: {saturated.sum()} instants with a motor at its torque limit are left out")
     at = np.flatnonzero(used & ~saturated)
     at = at[:: max(1, -(-len(at) // max_instants))]
-    first, last = max(record.times(name)[0] for name in names), min(record.times(name)[-1] for name in names)
-    motion = estimate_motion(mechanism, np.array([first, last]), fits, times[at])
+    motion = estimate_motion(mechanism, fits, times[at])
+    reversals = motion.near_reversals(regressor.has_friction)
+    if reversals.any():
+        warnings.append(
+            f"{source}: {reversals.sum()} instants near reversals are left out, where the direction of friction "
+            "is uncertain"
+        )
+        motion = motion.at(~reversals)
     tau = tau[at][np.isin(times[at], motion.t)]
     columns, force = regressor.rows(motion)
     to_motors = np.linalg.pinv(_to_forces(mechanism, motion)).astype(float)
@@ -166,8 +170,10 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
     def delayed(delay: float) -> Record:
         return replace(record, delay={**record.delay, **dict.fromkeys(torques, delay)})
 
+    fits = _equations(mechanism, regressor, delayed(0.0), [], MAX_DELAY_INSTANTS).fits  # do not depend on the delay
+
     def residual(delay: float) -> float:
-        equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS)
+        equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS, fits)
         off = fit_linear(equations.columns, equations.right, no_prior(len(regressor.names))).residual
         return float(np.log(np.mean(off**2, axis=0) + 1e-300).sum())
 
@@ -181,9 +187,9 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
 
 @dataclass(frozen=True, eq=False)
 class _MotionErrors:
-    """Errors of the equations of a record that errors of its splines cause.
+    """Errors of the equations of a record that errors of its fitted coordinates cause.
 
-    They are correlated over a knot interval, and may be too small beside the noise of torques to show in the residuals.
+    They are correlated over some instants, and may be too small beside the noise of torques to show in the residuals.
 
     Attributes
     ----------
@@ -193,7 +199,7 @@ class _MotionErrors:
 
     t: Array
     gains: Array
-    fits: Sequence[SplineFit]
+    fits: Sequence[SmoothFit]
     validation: bool
 
     @classmethod
@@ -201,7 +207,7 @@ class _MotionErrors:
         """Differentiate the equations with unknowns x at some instants, and interpolate between them."""
         some = np.unique(np.linspace(0, len(equations.motion.t) - 1, MAX_DIFFERENTIATED).astype(int))
         full, tau = equations.motion, equations.tau[some]
-        motion = replace(full, **{key: getattr(full, key)[some] for key in ("t", "q_tree", "v_tree", "a_tree", "rho")})
+        motion = full.at(some)
 
         def residual(at: MeasuredMotion) -> Array:
             columns, force = regressor.rows(at)
@@ -234,8 +240,8 @@ class _MotionErrors:
             total += np.einsum("kic,kjc->ij", one, other) / len(first)
         return (total + total.T) / 2
 
-    def _at(self, at: Array, k: int, fit: SplineFit) -> Array:
-        """Return the errors (instants, d, any) that errors of one spline cause at some instants."""
+    def _at(self, at: Array, k: int, fit: SmoothFit) -> Array:
+        """Return the errors (instants, d, any) that errors of one coordinate cause at some instants."""
         gains = self.gains[..., k][:, at]
         apart = np.einsum("okd,kl->okld", gains, np.eye(len(at))).reshape(3, len(at), -1)
         return fit.errors(self.t[at], apart).reshape(len(at), gains.shape[2], -1)
@@ -248,12 +254,14 @@ def _positive_part(covariance: Array) -> Array:
 
 
 def _prediction(
-    equations: _Equations, motors: Sequence[str], step: Array, noise_of_torques: Array, errors_of_motion: Array
-) -> Prediction:
+    equations: _Equations, motors: Sequence[str], step: Array, noise_of_torques: Array, errors_of_motion: Array,
+    errors_of_step: Array,
+) -> Prediction:  # fmt: skip
     """Return measured and predicted motor torques, and the variances of their difference.
 
-    These are the sums of those of the torques' noise, as given or as the fit estimated it, and of the errors of the
-    record's motion. Both are covariances of the equations, (d, d).
+    These are the sums of those of the torques' noise, as given or as the fit estimated it, of the errors of the
+    record's motion, and, if the record was not fitted, of the errors of the step. The first two are covariances of the
+    equations, (d, d), and the last one is that of the unknowns, (p, p).
     """
     residual = np.einsum("kmd,kd->km", equations.to_motors, equations.right - equations.columns @ step)
     names = tuple(f"tau.{motor}" for motor in motors)
@@ -265,6 +273,9 @@ def _prediction(
     noise = dict(zip(names, of_motors(noise_of_torques), strict=True)) | {
         name: std**2 for name, std in record.noise.items() if name in names
     }
-    of_motion = of_motors(errors_of_motion)
-    variances = {name: float(noise[name] + x) for name, x in zip(names, of_motion, strict=True)}
+    errors = of_motors(errors_of_motion)
+    if record.validation:
+        by_unknown = np.einsum("kmd,kdp->kmp", equations.to_motors, equations.columns)
+        errors += np.mean(np.sum((by_unknown @ errors_of_step) * by_unknown, axis=2), axis=0)
+    variances = {name: float(noise[name] + x) for name, x in zip(names, errors, strict=True)}
     return Prediction(record.source, record.validation, names, equations.motion.t, tau, tau - residual, variances)

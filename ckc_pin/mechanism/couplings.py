@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import MechanismError
@@ -43,7 +42,7 @@ class PiecewiseCurve:
     def __call__(self, x: float) -> float:
         """Return p(x)."""
         piece = int(np.searchsorted(self.breaks, x, side="right"))
-        return float(polynomial.polyval(x - self.origins[piece], self.coefficients[piece]))
+        return float(np.polyval(self.coefficients[piece][::-1], x - self.origins[piece]))
 
 
 def coupling_name(spec: CouplingSpec) -> str:
@@ -146,7 +145,7 @@ def _interpolate(points: Array) -> PiecewiseCurve:
     ends = np.zeros((2, inside.shape[1]))
     for end, piece, at in ((ends[0], inside[0], 0.0), (ends[1], inside[-1], x[-1] - origins[-1])):
         for order, factor in ((0, 1.0), (1, 1.0), (2, 0.5)):
-            end[order] = factor * polynomial.polyval(at, polynomial.polyder(piece, order))
+            end[order] = factor * np.polyval(np.polyder(piece[::-1], order), at)
     breaks = np.append(origins, x[-1])
     return PiecewiseCurve(breaks, np.concatenate([x[:1], breaks]), np.vstack([ends[:1], inside, ends[1:]]))
 

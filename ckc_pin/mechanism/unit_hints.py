@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from statistics import median
 
 import numpy as np
 
@@ -70,7 +69,8 @@ def _find_long(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[st
     """Name lengths many times longer than the others: a part of a file that is in millimetres."""
     lengths = {name: math.hypot(*x) for name, x in values.items() if isinstance(x, tuple) and _is_position(name)}
     lengths |= {name: x for name, x in values.items() if isinstance(x, float) and name.endswith("length")}
-    usual = median([x for x in lengths.values() if x > 0] or [mechanism.size])
+    positive = sorted(x for x in lengths.values() if x > 0) or [mechanism.size]
+    usual = (positive[(len(positive) - 1) // 2] + positive[len(positive) // 2]) / 2
     shortest_long = min((x for x in lengths.values() if _is_long(x, usual)), default=math.inf)
     if shortest_long > MIN_GAP * max((x for x in lengths.values() if not _is_long(x, usual)), default=0.0):
         yield from (f"{name} = {x:.4g} m" for name, x in lengths.items() if _is_long(x, usual))

@@ -28,7 +28,8 @@ BATCH = 16  # of them, towards which a tree grows at once
 MAX_BRANCH = 1.0  # rad, or sizes of the mechanism: length of a tree's branch towards a random configuration
 MIN_BRANCH = 1e-2  # the same: shorter branches are not added
 SMALL_PIECE = 2e-3  # the same: limits are not checked between the ends of shorter pieces
-MIN_PIECE, TREE_PIECE = 2.0**-11, 2.0**-6  # of a line; of a line between random configurations
+# Smallest pieces of lines: between given configurations, and between random ones, which need not come close to limits
+MIN_PIECE, TREE_PIECE = 2.0**-11, 2.0**-6
 MAX_RELATIVE_CHANGE = 0.6  # of phi_z along a piece: largest eigenvalue of phi_z^-1 times the change
 PATH_FACTOR = 1.5  # length of a quantity's way along a piece, relative to its change
 NEAR_ENDS = 0.5  # rad, or sizes of the mechanism: half of the random q are in the box of the ends, enlarged so much
@@ -81,6 +82,10 @@ class FreeSpace:
         """
         return follow(self.task, start, step, min_piece, self._accept)
 
+    def repeat(self, start: Nodes, step: Array) -> Nodes:
+        """Return the ends of lines in q that were followed before, so that limits need no check."""
+        return follow(self.task, start, step, MIN_PIECE, self._stays_regular)[0]
+
     def distances(self, nodes: Nodes) -> Array:
         """Return distances from the limits, negative outside: of sigma_min, coordinates and points, (m, limits)."""
         q = self._coordinates(nodes)
@@ -106,25 +111,33 @@ class FreeSpace:
         """Whether no limit and no singular configuration lies between the ends of pieces.
 
         A quantity does not reach a limit if its way is shorter than its distances from the limit at both ends together.
-        By Weyl's inequality, the smallest singular value of phi_z changes by no more than phi_z does. The matrices
-        phi_z + t change are regular for t from 0 to 1 if all eigenvalues of phi_z^-1 change are smaller than 1.
+        By Weyl's inequality, the smallest singular value of phi_z changes by no more than phi_z does.
         """
         begin, finish = self.distances(start), self.distances(end)
         accepted = (finish >= -LIMIT_TOLERANCE).all(axis=1)
-        phi_z = self._phi_z(start)
-        change = self._phi_z(end) - phi_z
         ways = [np.abs(self._coordinates(end) - self._coordinates(start))]
         for a, b in zip(self._points(start), self._points(end), strict=True):
             ways.append(np.linalg.norm(b - a, axis=1)[:, None])
         if self._min_sigma:
-            ways.append(np.linalg.norm(change, 2, axis=(1, 2))[:, None])
+            ways.append(np.linalg.norm(self._phi_z(end) - self._phi_z(start), 2, axis=(1, 2))[:, None])
         between = (begin + finish >= PATH_FACTOR * np.hstack(ways)).all(axis=1)
         accepted &= between | (self.length(end.values - start.values) <= SMALL_PIECE)
-        if phi_z.shape[2]:
-            relative = np.linalg.solve(phi_z, change)
-            suspect = accepted & (np.linalg.norm(relative, axis=(1, 2)) > MAX_RELATIVE_CHANGE)
-            accepted[suspect] = np.abs(np.linalg.eigvals(relative[suspect])).max(axis=1) <= MAX_RELATIVE_CHANGE
+        if accepted.any():
+            accepted[accepted] = self._stays_regular(start[accepted], end[accepted])
         return np.asarray(accepted)
+
+    def _stays_regular(self, start: Nodes, end: Nodes) -> BoolArray:
+        """Whether the matrices between phi_z at both ends of pieces are regular.
+
+        These are phi_z + t change for t from 0 to 1, if all eigenvalues of phi_z^-1 change are smaller than 1.
+        """
+        phi_z = self._phi_z(start)
+        regular = np.ones(len(phi_z), dtype=bool)
+        if phi_z.shape[2]:
+            relative = np.linalg.solve(phi_z, self._phi_z(end) - phi_z)
+            suspect = np.linalg.norm(relative, axis=(1, 2)) > MAX_RELATIVE_CHANGE
+            regular[suspect] = np.abs(np.linalg.eigvals(relative[suspect])).max(axis=1) <= MAX_RELATIVE_CHANGE
+        return regular
 
     def _phi_z(self, nodes: Nodes) -> Array:
         return nodes.J[:, self.task.extended.free][:, :, self.mechanism.partition.z]
@@ -309,7 +322,7 @@ def _shorten(space: FreeSpace, path: Nodes) -> Nodes:
         ends = [_find_places_along(space, path, s, cuts[:, k], pieces[:, k]) for k in (0, 1)]
         step = ends[1].values - ends[0].values
         saved = cuts[:, 1] - cuts[:, 0] - space.length(step)
-        reached, arrived = space.follow(ends[0], step)
+        reached, arrived = space.follow(ends[0], step, TREE_PIECE)
         saved = np.where(arrived & space.is_same(reached, ends[1]), saved, 0.0)
         best = int(np.argmax(saved))
         if saved[best] > MIN_SAVING * s[-1]:
@@ -323,7 +336,7 @@ def _find_places_along(space: FreeSpace, path: Nodes, s: Array, at: Array, piece
     """Return the configurations at lengths along a path."""
     start = path[piece]
     part = (at - s[piece]) / (s[piece + 1] - s[piece])
-    return space.follow(start, part[:, None] * (path.values[piece + 1] - start.values))[0]
+    return space.repeat(start, part[:, None] * (path.values[piece + 1] - start.values))
 
 
 def _round(space: FreeSpace, path: Nodes) -> PiecewisePolynomial | None:

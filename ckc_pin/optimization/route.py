@@ -124,8 +124,9 @@ class Route(Immutable):
         t, rows = values.torque_t + self.offsets[phase], torque
         for k in np.flatnonzero(self.rests)[::-1].tolist():
             at = int(np.searchsorted(phase, k, side="right"))
-            begin = t[at - 1]
-            t = np.insert(t, at, [begin, begin + self.rests[k]])
+            # The next phase begins where the rest ends, to the last digit.
+            end = t[at] if at < len(t) else t[at - 1] + self.rests[k]
+            t = np.insert(t, at, [t[at - 1], end])
             rows = np.insert(rows, at, [self.rest_torque[k], self.rest_torque[k]], axis=0)
         return t, rows
 

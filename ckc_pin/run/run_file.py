@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import zipfile
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -17,6 +16,9 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.spec import FrameSpec, Vector3
 from ckc_pin.scene.spec import InitialSpec, PrescribedSpec
+
+if TYPE_CHECKING:
+    import zipfile
 
 __all__ = ["ARRAYS", "FORMAT", "OPTIONAL", "WORKS", "RunMeta", "hashes_of", "read_run", "write_run"]
 
@@ -159,6 +161,8 @@ def _read_arrays(path: Path) -> dict[str, Any]:
     """Read the arrays, after checking the names, sizes and types that the file declares."""
     if path.stat().st_size > MAX_BYTES:
         raise InputError(f"{path}: a file of {path.stat().st_size} bytes; a run has at most {MAX_BYTES}")
+    import zipfile
+
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         names = sorted(entry.filename for entry in entries)

@@ -12,6 +12,8 @@ from scipy.interpolate import CubicSpline
 
 import ckc_pin
 from ckc_pin import InputError, Plan, optimize
+from ckc_pin.optimization.mesh_motion import DEGREE, Guess, Mesh, Places
+from ckc_pin.optimization.route import Route
 from tests.contract.helpers.command import ckc
 from tests.optimization.small_models import GRAVITY, LENGTH, MASS, pendulum, require_replay, slider, table
 
@@ -22,6 +24,24 @@ def fastest(distance: float, before: float, after: float) -> float:
     """Return the time of a mass between two rates that are not larger than the highest one, with one switch."""
     highest = np.sqrt(ACCELERATION * distance + (before**2 + after**2) / 2)
     return float((2 * highest - before - after) / ACCELERATION)
+
+
+def test_torques_begin_again_exactly_when_a_rest_ends() -> None:
+    """However sums of times round, rows of the table do not go back in time."""
+    random, phases = np.random.default_rng(0), 4
+    still = np.zeros((phases + 1, 1))
+    places = Places(still, still, np.zeros(phases + 1))
+    for _ in range(100):
+        durations, rests = random.uniform(0.01, 0.1, (2, phases))
+        mesh = Mesh.uniform(8, durations)
+        knots, count = len(mesh.knot), len(mesh.steps)
+        sizes = [(count + 1, 1), (count + 1, 1), (count, DEGREE, 1), (knots, 1), (count * DEGREE, 1)]
+        values = Guess(mesh, durations, *map(np.zeros, sizes))
+        route = Route(places, rests, np.ones((phases, 1)), np.inf, ())
+        t, torque = route.torques(values, values.torque)
+        assert np.diff(t).min() >= 0
+        assert t[-1] == pytest.approx(durations.sum() + rests.sum())
+        assert np.trapezoid(torque[:, 0], t) == pytest.approx(rests.sum())
 
 
 def test_a_place_beyond_the_end_is_reached_and_left_in_bang_bang_motions() -> None:

@@ -79,14 +79,13 @@ def expressions(dynamics: ReducedDynamics) -> ExpressionFunctions:
     return ExpressionFunctions(dynamics, rows)
 
 
-@pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "slider_crank", "andrews", "two_ur5"])
+@pytest.mark.parametrize("name", ["five_bar", "three_rrr", "delta", "slider_crank", "andrews"])
 def test_derivatives_of_expressions_are_exact(name: str) -> None:
     dynamics = dynamics_of(name)
     require_exact(dynamics, expressions(dynamics), 2)
 
 
-@pytest.mark.parametrize("kind", ["point", "universal", "hinge", "cylindrical"])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("kind", "seed"), [("point", 0), ("universal", 1), ("hinge", 0), ("cylindrical", 1)])
 def test_derivatives_are_exact_in_random_mechanisms(kind: LoopType, seed: int) -> None:
     closed = next(x for k in range(50) if (x := closed_mechanism(kind, 100 * seed + k, free=False)).regular)
     dynamics = ReducedDynamics(closed.mechanism)
