@@ -163,10 +163,10 @@ def _minimum_norm_solution(jacobian: Array, phi: Array) -> Array:
 
 def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
     """Return closed configurations a small step along the tangent space, if there are any."""
+    random = np.random.default_rng(0)
     configurations = []
-    for k in range(1, 1 + (NEARBY_COUNT if len(tangent) else 0)):
-        # A direction in general position, without NumPy's random numbers, whose import takes longer than a short run.
-        step = np.cos(k * np.sqrt(np.arange(2.0, len(tangent) + 2))) @ tangent
+    for _ in range(NEARBY_COUNT if len(tangent) else 0):
+        step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
         step *= NEARBY_STEP / np.abs(step).max() * tree.step_scale
         closed = close_loops(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
         if closed.residual <= 10 * accept:

@@ -123,7 +123,7 @@ def _refine_profile(
     inside = np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 2)[1:-1]
     suspect: BoolArray | None = None  # intervals to check; all of them before the end
     is_fastest = _is_fastest(spec, limits)
-    time = limits.time  # limit of the optimizer's duration, which assumes uniform acceleration in each interval
+    time, corrected = limits.time, limits.time  # of the optimizer, whose durations have errors of its grid
     for round_ in range(MAX_REFINEMENTS):
         along = path_dynamics(dynamics, path, s)
         _require_within(limits, along, dynamics)
@@ -132,22 +132,22 @@ def _refine_profile(
             _require_time(profile, limits)
         else:
             profile, iterations = _make_triangle(s, limits.time), 0
-        parts, is_on_time = {"time": float(profile.t[-1])}, True
+        parts = {"time": float(profile.t[-1])}
         if not is_fastest:
+            time = corrected
             optimum = optimize_profile(dynamics, along, replace(narrowed, time=time), spec.minimize, profile)
             profile, iterations, parts = optimum.profile, optimum.iterations, optimum.parts
             parts |= {"time": float(profile.t[-1])} if "time" in parts else {}
-            misses = float(profile.t[-1]) / limits.time - 1
-            is_free = _uniform_times(profile).sum() < time * (1 - TIME_TOLERANCE)
-            is_on_time = misses < TIME_TOLERANCE and (is_free or misses > -TIME_TOLERANCE)
-            time = time if is_on_time else time / (1 + misses)
+            corrected = _correct_time(profile, limits.time, time)
         motion, total = PathMotion(path, profile), total + iterations
-        exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect) | _misses_time(profile)
-        if round_ < SWITCH_REFINEMENTS and is_fastest:
+        exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect)
+        if not is_fastest:
+            exceeded |= _misses_time(profile)
+        elif round_ < SWITCH_REFINEMENTS:
             exceeded |= _switches(profile)
         if not exceeded.any() and suspect is not None:
             exceeded = _exceeds_inside(dynamics, motion, between, inside, None)
-        if not exceeded.any() and is_on_time:
+        if not exceeded.any() and corrected == time:
             return motion, total, parts
         if not exceeded.any():
             suspect = None
@@ -180,6 +180,17 @@ def _make_triangle(s: Array, duration: float) -> SpeedProfile:
     """Return the profile that accelerates uniformly up to the middle, and brakes from there on."""
     acceleration = 4 / (duration if np.isfinite(duration) else DURATION_GUESS) ** 2
     return SpeedProfile(s, 2 * acceleration * np.minimum(s - s[0], s[-1] - s), np.zeros(len(s) - 1))
+
+
+def _correct_time(profile: SpeedProfile, limit: float, time: float) -> float:
+    """Return the limit of the optimizer's duration with which its motion takes the time `limit`.
+
+    Its present limit is returned if the motion keeps it, and takes this time or is free to take less.
+    """
+    misses = float(profile.t[-1]) / limit - 1
+    is_free = _uniform_times(profile).sum() < time * (1 - TIME_TOLERANCE)
+    is_on_time = misses < TIME_TOLERANCE and (is_free or misses > -TIME_TOLERANCE)
+    return time if is_on_time else time / (1 + misses)
 
 
 def _uniform_times(profile: SpeedProfile) -> Array:

@@ -70,7 +70,11 @@ CASES = [
         ["malformed TOML", "line 1", "named in a mechanism.toml"],
         files={"bar/odd.toml": '<robot name="r"><link name="a"/></robot>'},
     ),
-    Bad("scene as mechanism", [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"], ["unknown key 'mechanism'"]),
+    Bad(
+        "scene as mechanism",
+        [*TERMS[:1], "bar/swing.scene.toml", "--q", "{}"],
+        ["swing.scene.toml: a scene; expected a mechanism"],
+    ),
     Bad("a name that no file can have", ["check", "\0.toml"], [r"'\x00.toml'", "not a valid file name"]),
     Bad("a name too long for a file", ["check", "x" * 5000 + ".toml"], ["xx.toml: cannot be read: File name too"]),
     # exciting motions
