@@ -66,8 +66,11 @@ def identify_torques(
     prior_equations = make_prior(regressor, prior)
     warnings: list[str] = []
     with one_blas_thread(with_scipy=True):
-        records = [_with_delay(mechanism, regressor, record, warnings) for record in records]
-        equations = [_equations(mechanism, regressor, record, warnings) for record in records]
+        equations = []
+        for record in records:
+            fits = _fit_coordinates(mechanism, record)
+            delayed = _with_delay(mechanism, regressor, record, fits, warnings)
+            equations.append(_equations(mechanism, regressor, delayed, fits, warnings))
         fitted = [x for x in equations if not x.record.validation]
         columns, right = (np.concatenate([getattr(x, key) for x in fitted]) for key in ("columns", "right"))
         if right.size + len(prior_equations[0]) < columns.shape[2]:
@@ -99,15 +102,8 @@ def identify_torques(
     )  # fmt: skip
 
 
-def _equations(
-    mechanism: Mechanism,
-    regressor: TorqueRegressor,
-    record: Record,
-    warnings: list[str],
-    max_instants: int = MAX_INSTANTS,
-    fits: Mapping[str, SmoothFit] | None = None,
-) -> _Equations:
-    """Estimate the motion of a record, from fits of its coordinates if they are known, and set up its equations."""
+def _fit_coordinates(mechanism: Mechanism, record: Record) -> dict[str, SmoothFit]:
+    """Fit smooth functions to the measured coordinates of a record, after checking that nothing is missing."""
     names = [name for name in mechanism.coordinates if name in record.values]
     torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     required = [*torques, *(mechanism.independent if len(names) < mechanism.d else ())]
@@ -116,7 +112,19 @@ def _equations(
         needed = f"{mechanism.d} coordinates and the torque of every motor"
         raise InputError(describe_missing(record, missing, needed))
     require_radians(mechanism, record, names)
-    fits = fit_record(record, names) if fits is None else fits
+    return fit_record(record, names)
+
+
+def _equations(
+    mechanism: Mechanism,
+    regressor: TorqueRegressor,
+    record: Record,
+    fits: Mapping[str, SmoothFit],
+    warnings: list[str],
+    max_instants: int = MAX_INSTANTS,
+) -> _Equations:
+    """Estimate the motion of a record from the fits of its coordinates, and set up its equations."""
+    torques = [f"tau.{motor}" for motor in mechanism.motors.names]
     tau = np.array([record.values[name] for name in torques]).T.reshape(-1, len(torques))
     times = record.times(torques[0]) if torques else record.t
     used = np.all(np.isfinite(tau), axis=1)
@@ -159,7 +167,9 @@ def _generalized(mechanism: Mechanism, motion: MeasuredMotion, tau: Array) -> Ar
     return np.einsum("kdm,km->kd", _to_forces(mechanism, motion), tau)
 
 
-def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record, warnings: list[str]) -> Record:
+def _with_delay(
+    mechanism: Mechanism, regressor: TorqueRegressor, record: Record, fits: Mapping[str, SmoothFit], warnings: list[str]
+) -> Record:
     """Return the record with the delay of its torques that leaves the smallest residual, if it is to be estimated."""
     from scipy.optimize import minimize_scalar
 
@@ -170,10 +180,8 @@ def _with_delay(mechanism: Mechanism, regressor: TorqueRegressor, record: Record
     def delayed(delay: float) -> Record:
         return replace(record, delay={**record.delay, **dict.fromkeys(torques, delay)})
 
-    fits = _equations(mechanism, regressor, delayed(0.0), [], MAX_DELAY_INSTANTS).fits  # do not depend on the delay
-
     def residual(delay: float) -> float:
-        equations = _equations(mechanism, regressor, delayed(delay), [], MAX_DELAY_INSTANTS, fits)
+        equations = _equations(mechanism, regressor, delayed(delay), fits, [], MAX_DELAY_INSTANTS)
         off = fit_linear(equations.columns, equations.right, no_prior(len(regressor.names))).residual
         return float(np.log(np.mean(off**2, axis=0) + 1e-300).sum())
 
