@@ -61,7 +61,7 @@ class SplineFit(SmoothFit):
 
 
 class KnotChoice(NamedTuple):
-    """Score of generalized cross-validation, and what has it."""
+    """Degree and number of knot intervals of a spline, with its score of generalized cross-validation."""
 
     score: float
     degree: int

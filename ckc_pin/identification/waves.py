@@ -62,7 +62,7 @@ class WaveFit(SmoothFit):
 
 
 class _Solution(NamedTuple):
-    """Score of cross-validation, number of waves, amplitudes, factor of their covariance, and noise."""
+    """Waves fitted to measurements: their score of cross-validation, amplitudes, and the factor of the covariance."""
 
     score: float
     waves: int

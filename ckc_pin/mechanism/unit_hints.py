@@ -69,6 +69,7 @@ def _find_long(mechanism: Mechanism, values: Mapping[str, Value]) -> Iterator[st
     """Name lengths many times longer than the others: a part of a file that is in millimetres."""
     lengths = {name: math.hypot(*x) for name, x in values.items() if isinstance(x, tuple) and _is_position(name)}
     lengths |= {name: x for name, x in values.items() if isinstance(x, float) and name.endswith("length")}
+    # The median by hand: `statistics` and NumPy's import much more than a short run needs.
     positive = sorted(x for x in lengths.values() if x > 0) or [mechanism.size]
     usual = (positive[(len(positive) - 1) // 2] + positive[len(positive) // 2]) / 2
     shortest_long = min((x for x in lengths.values() if _is_long(x, usual)), default=math.inf)

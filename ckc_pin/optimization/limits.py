@@ -86,7 +86,7 @@ class MotionLimits(Immutable):
         first = len(self.names) - len(self.spheres)
         largest[first:] = [radius for _, _, radius in self.spheres]
         if np.isfinite(self.total_power):
-            largest[first - 1] = self.total_power
+            largest[self.names.index("total_power")] = self.total_power
         return np.maximum(largest, 1e-12)
 
 

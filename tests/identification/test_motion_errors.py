@@ -6,8 +6,6 @@ two standard deviations, towards the truth. Standard deviations do not count tha
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 
@@ -22,7 +20,6 @@ NAMES = ("link.*.inertial", "joint.*.damping")
 NOISE = 10 * CASES["delta"].noise  # of `measure_motion`
 
 
-@cache
 def fit():
     """Return the result from true start values, and the values of its unknowns."""
     result = identify(load_case("delta"), measure_motion("delta", 0), NAMES, method="motion")
@@ -34,7 +31,6 @@ def evaluate(combination, values):
     return sum(c * values[name] for name, c in combination.coefficients.items())
 
 
-@cache
 def linear_problem():
     """Return derivatives of the measured values by unknown and start, in units of the noise, and the errors."""
     mechanism, data = load_case("delta"), measure_motion("delta", 0)
