@@ -737,6 +737,38 @@ class SparseElimination:
     def operations(self) -> int:
         """Multiplications of a factorization and a solution."""
 
+class ArticulatedElimination:
+    """Eliminates eq. 1 by articulated bodies, without pivoting."""
+
+    def __init__(self, core: dict[str, Any]) -> None: ...
+    def acceleration(
+        self,
+        q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        v_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        u_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    ) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")] | None:
+        """Return the acceleration of eq. 1; None if a pivot is small."""
+
+    def unit_force_responses(
+        self, q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)], at: Sequence[int]
+    ) -> Annotated[NDArray[numpy.float64], dict(shape=(None, None), order="F")] | None:
+        """
+        Return the accelerations that unit forces on coordinates cause, one column each; None if a pivot is small.
+        """
+
+    def motion(
+        self,
+        q_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+        v_tree: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    ) -> tuple[
+        Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")],
+        Annotated[NDArray[numpy.float64], dict(shape=(None, None), order="F")],
+        Annotated[NDArray[numpy.float64], dict(shape=(None, None), order="F")],
+    ]:
+        """
+        Return C'v + h' without springs, and the joints' velocities and bias accelerations, one column each, in world axes at the world's origin.
+        """
+
 class Turn:
     """Holds a gate's lock within a `with` block."""
 

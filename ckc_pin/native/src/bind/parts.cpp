@@ -5,6 +5,7 @@
 #include <nanobind/stl/pair.h>
 
 #include "bind/run.hpp"
+#include "loops/articulated_elimination.hpp"
 #include "loops/sparse_elimination.hpp"
 #include "tree/rotation.hpp"
 #include "motion/stiffness.hpp"
@@ -63,13 +64,56 @@ struct BoundSparseElimination {
   BoundSparseElimination(const nb::typed<nb::dict, nb::str, nb::any>& table)
       : core(core_from_table(table)),
         elimination(core->tree.inertia_pattern, core->constraints.relative_pattern,
-                    get<Indices>(table, "independent_rows")) {}
+                    get<Indices>(table, "independent_rows")) {
+    core->allow_elimination(false);  // it would leave D' out
+  }
   std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
     core->set_configuration(q_tree, true), core->set_velocity(v_tree), core->compute_J(), core->compute_bias();
     if (!elimination.compute(core->tree.D(), core->constraints.J)) return std::nullopt;
     Vector a(core->n);
     elimination.solve(u_tree - core->bias_tree + core->damping_tree, core->J_dot_v, a);
     return a;
+  }
+};
+
+// Elimination by articulated bodies, likewise.
+struct BoundArticulatedElimination {
+  std::unique_ptr<Core> core;
+  ArticulatedElimination elimination;
+
+  BoundArticulatedElimination(const nb::typed<nb::dict, nb::str, nb::any>& table)
+      : core(core_from_table(table)),
+        elimination(core->tree, core->constraints, get<Indices>(table, "independent_rows")) {
+    core->allow_elimination(false);  // its bias is Pinocchio's
+  }
+  bool compute(VectorArg q_tree) {
+    core->set_configuration(q_tree), core->compute_J();
+    elimination.bodies.set_configuration(core->tree);
+    return elimination.compute(core->constraints.J);
+  }
+  std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
+    if (!compute(q_tree)) return std::nullopt;
+    core->set_velocity(v_tree), core->compute_bias();
+    Vector a(core->n);
+    elimination.solve(u_tree - core->bias_tree + core->damping_tree, core->J_dot_v, a);
+    return a;
+  }
+  std::optional<Matrix> unit_force_responses(VectorArg q_tree, const Indices& at) {
+    if (!compute(q_tree)) return std::nullopt;
+    Matrix columns(core->n, static_cast<Eigen::Index>(at.size()));
+    elimination.solve_unit_forces(at, columns);
+    return columns;
+  }
+  nb::typed<nb::tuple, Vector, Matrix, Matrix> motion(VectorArg q_tree, VectorArg v_tree) {
+    core->set_configuration(q_tree);
+    ArticulatedBodies& bodies = elimination.bodies;
+    bodies.set_configuration(core->tree);
+    const Vector bias = bodies.compute_bias(v_tree);
+    const int joints = core->tree.joints;
+    Matrix velocities(6, joints), accelerations(6, joints);
+    for (int joint = 0; joint < joints; ++joint)
+      velocities.col(joint) = bodies.velocity(joint), accelerations.col(joint) = bodies.bias_acceleration(joint);
+    return nb::make_tuple(bias, velocities, accelerations);
   }
 };
 
@@ -155,6 +199,16 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
            "Return the acceleration of eq. 1; None if a pivot is small.")
       .def_prop_ro("operations", [](const BoundSparseElimination& of) { return of.elimination.operations(); },
                    "Multiplications of a factorization and a solution.");
+  nb::class_<BoundArticulatedElimination>(m, "ArticulatedElimination",
+                                          "Eliminates eq. 1 by articulated bodies, without pivoting.")
+      .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&>(), "core"_a)
+      .def("acceleration", &BoundArticulatedElimination::acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a,
+           "Return the acceleration of eq. 1; None if a pivot is small.")
+      .def("unit_force_responses", &BoundArticulatedElimination::unit_force_responses, "q_tree"_a, "at"_a,
+           "Return the accelerations that unit forces on coordinates cause, one column each; None if a pivot is small.")
+      .def("motion", &BoundArticulatedElimination::motion, "q_tree"_a, "v_tree"_a,
+           "Return C'v + h' without springs, and the joints' velocities and bias accelerations, one column each, in "
+           "world axes at the world's origin.");
   binding
       .def("rank", &rank, "y"_a,
            "Return the rank monitor's smallest singular value of J and its rate at a DAE's state.")

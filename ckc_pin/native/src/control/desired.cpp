@@ -174,7 +174,7 @@ bool PointTrajectory::operator()(double t, Out x, Out x_dot, Out x_ddot) {
   set_target(x_dot_, nullptr);
   factor_.solve(target_, v_);
   tree_.compute_bias(q_tree_, v_);
-  constraints_.update_rates(tree_, v_);
+  constraints_.update_rates(tree_, tree_, v_);
   constraints_.bias(J_dot_v_);
   set_target(x_ddot_, nullptr);
   for (int i = 0; i < tree_.n; ++i) target_(i) -= J_dot_v_(task_.psi[i]);

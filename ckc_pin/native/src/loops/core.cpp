@@ -1,4 +1,5 @@
 #include "loops/core.hpp"
+#include "loops/articulated_elimination.hpp"
 #include "loops/compiled_terms.hpp"
 #include "loops/sparse_elimination.hpp"
 
@@ -13,9 +14,10 @@ namespace ckc {
 // nonzero entries than the second.
 constexpr int max_sparse_size = 12;
 constexpr double min_dense_share = 0.2;
-// Duration of a multiplication in sparse elimination, in units of one in projection, which works on dense columns. It
-// takes 3 to 4 units when repeated; in a run, where other code follows, the processor predicts its short loops badly.
-constexpr double sparse_cost = 6.0;
+// Durations in units of a multiplication in projection, which works on dense columns: of one in sparse elimination, which
+// takes 3 to 4 units when repeated (in a run, where other code follows, the processor predicts its short loops badly),
+// and of a visit of a coordinate by the sweeps of articulated bodies.
+constexpr double sparse_cost = 6.0, visit_cost = 100.0;
 
 Core::Core(CoreTable table)
     : tree(table.model, std::move(table.q_index)),
@@ -43,19 +45,27 @@ Core::Core(CoreTable table)
   size_t entries = 0;
   for (const Indices& rows : tree.inertia_pattern) entries += 2 * rows.size();
   D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
-  choose_sparse_elimination();
+  choose_elimination();
 }
 
-// Use sparse elimination if it costs less than projection: D' T, T^T D' T and its Cholesky factorization.
-void Core::choose_sparse_elimination() {
-  sparse_.reset();
+// Use elimination if it costs less than projection: D' T, T^T D' T and its Cholesky factorization.
+void Core::choose_elimination() {
+  sparse_.reset(), articulated_.reset();
   const double size = n, d = n - rank;
   if (compiled || n <= max_sparse_size || static_cast<int>(independent_rows_.size()) != rank) return;
   double inertia_entries = 0.0;
   for (const Indices& rows : tree.inertia_pattern) inertia_entries += 2.0 * static_cast<double>(rows.size()) - 1.0;
   const double projection = d * (D_tree_is_dense_ ? size * size : inertia_entries) + size * d * d + d * d * d / 6.0;
+  if (projection < sparse_cost * size) return;
   auto sparse = std::make_unique<SparseElimination>(tree.inertia_pattern, constraints.relative_pattern, independent_rows_);
-  if (sparse_cost * static_cast<double>(sparse->operations()) < projection) sparse_ = std::move(sparse);
+  const double in_matrices = sparse_cost * static_cast<double>(sparse->operations());
+  if (!tree.has_shared_rotors()) {
+    auto articulated = std::make_unique<ArticulatedElimination>(tree, constraints, independent_rows_);
+    const double by_bodies = visit_cost * static_cast<double>(articulated->visits()) +
+                             sparse_cost * static_cast<double>(articulated->operations());
+    if (by_bodies < std::min(projection, in_matrices)) articulated_ = std::move(articulated);
+  }
+  if (!articulated_ && in_matrices < projection) sparse_ = std::move(sparse);
 }
 
 Core::~Core() = default;
@@ -104,7 +114,7 @@ void Core::set_parameters(Parameter parameter, In values) {
     constraints.set_parameters(static_cast<ConstraintRows::Parameter>(offset_from(Parameter::point)), values);
   else
     tree.set_parameters(static_cast<Tree::Parameter>(k), values);
-  if (parameter == Parameter::rotors) choose_sparse_elimination();  // rotors between branches couple coordinates
+  if (parameter == Parameter::rotors) choose_elimination();  // rotors between branches couple coordinates
   valid_parts_ = 0, basis_configuration_ = -1, ++configuration_count;
 }
 
@@ -126,11 +136,12 @@ void Core::set_configuration(In q_tree_, bool with_inertia) {
     valid_parts_ = jacobian_of_rows;
     return;
   }
-  if (with_inertia)
+  const bool needs_D = with_inertia && !eliminates_by_bodies();
+  if (needs_D)
     tree.compute_D(q_tree);
   else
     tree.set_configuration(q_tree);
-  valid_parts_ = (with_inertia ? inertia_of_tree : 0u) | tree_is_set;
+  valid_parts_ = (needs_D ? inertia_of_tree : 0u) | tree_is_set;
   constraints.update(tree, q_tree);
   if (has_row_motion()) constraints.phi -= row_motion.value;
 }
@@ -220,6 +231,13 @@ void Core::multiply_D_tree(In x, Out product) const {
   }
 }
 
+double Core::joint_inertia(int k) {
+  const bool has_factors = eliminates_by_bodies() && elimination_is_accurate_ && factors_configuration_ == configuration_count;
+  if (has_factors) return articulated_->bodies.inertia(k);
+  compute_D_tree();
+  return D_tree()(k, k);
+}
+
 double Core::potential_energy() {
   if (compiled) return compiled->potential_energy(q_tree);
   update_spring_lengths();
@@ -245,8 +263,15 @@ void Core::multiply_rho_transposed(In force, Out generalized) const {
 void Core::update_row_rates() {
   if (is_valid(row_rates)) return;
   update_tree();
-  bias_without_springs_ = tree.compute_bias(q_tree, v_tree);
-  constraints.update_rates(tree, v_tree);
+  const bool has_small_pivot = factors_configuration_ == configuration_count && !elimination_is_accurate_;
+  if (eliminates_by_bodies() && !has_small_pivot) {
+    ArticulatedBodies& bodies = placed_bodies();
+    bias_without_springs_ = bodies.compute_bias(v_tree);
+    constraints.update_rates(tree, bodies, v_tree);
+  } else {
+    bias_without_springs_ = tree.compute_bias(q_tree, v_tree);
+    constraints.update_rates(tree, tree, v_tree);
+  }
   valid_parts_ |= row_rates;
 }
 

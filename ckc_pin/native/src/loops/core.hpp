@@ -15,6 +15,8 @@
 
 namespace ckc {
 
+class ArticulatedBodies;
+class ArticulatedElimination;
 class CompiledTerms;
 class SparseElimination;
 
@@ -138,7 +140,7 @@ class Core {
   void solve_z(In b, Out x) { phi_z.solve(b, x); }
   void closure_step_in_z(In residual, Out x);     // step x of z alone with J x = -residual; requires phi_z
   void multiply_D_tree(In x, Out product) const;  // D' x
-  double joint_inertia(int k) const { return D_tree()(k, k); }  // inertia of a coordinate without the loops
+  double joint_inertia(int k);  // inertia of a coordinate without the loops
   double potential_energy();
   Energy energy(In v, Out momentum);
 
@@ -180,10 +182,10 @@ class Core {
   // Acceleration of eq. 1, by elimination or by projection on the tangent space; `correction` is added to
   // J_dot v. False if J has lost rank.
   bool dae_acceleration(In u_tree, In correction, Out acceleration);
-  // Elimination of eq. 1 without pivoting, by the compiled terms or in sparse matrices. It may be used if
+  // Elimination of eq. 1 without pivoting, by compiled terms, by articulated bodies or in sparse matrices. It may be used if
   // `allow_elimination` says so (loops/elimination_check.hpp decides). False if there is none, it is not allowed, or a
   // pivot is small.
-  bool has_elimination() const { return compiled || sparse_; }
+  bool has_elimination() const { return compiled || articulated_ || sparse_; }
   void allow_elimination(bool allowed);
   bool eliminate(In u_tree, In correction, Out acceleration);
   bool elimination_step(In residual, Out x);  // as `closure_step`
@@ -256,8 +258,12 @@ class Core {
   void body_velocity_components(Components& of);
   bool find_basis_for_check();                      // by pivoting; the basis is not used later
   void project_on_tangent_space(In u_tree, Out a);  // eq. 1, requires tangent_ and x_
-  void choose_sparse_elimination();
-  bool factorize_sparsely();
+  void choose_elimination();
+  bool eliminates() const;  // without compiled terms
+  bool eliminates_by_bodies() const { return articulated_ && eliminates(); }
+  ArticulatedBodies& placed_bodies();
+  bool factorize_without_pivoting();
+  void solve_by_factors(In force, In residual, Out a);
   bool project_by_mass_levels(In u_tree, Out a);    // the same; false if some motion moves no mass
   double relative_difference(In a, In reference);   // requires project_on_tangent_space
   bool find_basis_by_partition();
@@ -268,9 +274,11 @@ class Core {
   bool D_tree_is_dense_;
   bool uses_mass_levels_ = false;
   const Indices independent_rows_;
-  std::unique_ptr<SparseElimination> sparse_;  // null if projection is cheaper
-  bool sparse_allowed_ = true, sparse_is_accurate_ = false;
-  long sparse_configuration_ = -1;  // `configuration_count` of the last sparse factorization
+  std::unique_ptr<ArticulatedElimination> articulated_;  // at most one of them; none if projection is cheaper
+  std::unique_ptr<SparseElimination> sparse_;
+  bool elimination_allowed_ = true, elimination_is_accurate_ = false;
+  // `configuration_count` of the last factorization without pivoting, and of the bodies' placement
+  long factors_configuration_ = -1, bodies_configuration_ = -1;
   unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
   Matrix C_tree_, D_compiled_, D_rho_, tangent_, D_tangent_;
   Indices basis_coordinates_;           // by column of the tangent basis: its coordinate

@@ -5,6 +5,7 @@
 #include <numeric>
 #include <utility>
 
+#include "loops/articulated_elimination.hpp"
 #include "loops/core.hpp"
 #include "loops/compiled_terms.hpp"
 #include "loops/partition.hpp"
@@ -137,33 +138,57 @@ void Core::closure_step_in_z(In residual, Out x) {
 }
 
 void Core::allow_elimination(bool allowed) {
-  sparse_allowed_ = allowed;
+  elimination_allowed_ = allowed;
   if (compiled) compiled->allow_elimination(allowed);
 }
 
-bool Core::factorize_sparsely() {
-  if (!sparse_ || !sparse_allowed_ || compiled || !released_.empty() || uses_mass_levels_) return false;
-  if (sparse_configuration_ == configuration_count) return sparse_is_accurate_;
-  compute_J(), compute_D_tree();
-  sparse_configuration_ = configuration_count;
-  return sparse_is_accurate_ = sparse_->compute(D_tree(), constraints.J);
+bool Core::eliminates() const {
+  return (articulated_ || sparse_) && elimination_allowed_ && !compiled && released_.empty() && !uses_mass_levels_;
+}
+
+ArticulatedBodies& Core::placed_bodies() {
+  if (bodies_configuration_ != configuration_count) articulated_->bodies.set_configuration(tree);
+  bodies_configuration_ = configuration_count;
+  return articulated_->bodies;
+}
+
+bool Core::factorize_without_pivoting() {
+  if (!eliminates()) return false;
+  if (factors_configuration_ == configuration_count) return elimination_is_accurate_;
+  compute_J();
+  if (articulated_) {
+    placed_bodies();
+    elimination_is_accurate_ = articulated_->compute(constraints.J);
+  } else {
+    compute_D_tree();
+    elimination_is_accurate_ = sparse_->compute(D_tree(), constraints.J);
+  }
+  factors_configuration_ = configuration_count;
+  return elimination_is_accurate_;
+}
+
+void Core::solve_by_factors(In force, In residual, Out a) {
+  if (articulated_)
+    articulated_->solve(force, residual, a);
+  else
+    sparse_->solve(force, residual, a);
 }
 
 bool Core::eliminate(In u_tree, In correction, Out acceleration) {
   if (compiled) return compiled_acceleration(q_tree, v_tree, u_tree, correction, acceleration);
-  if (!factorize_sparsely()) return false;
+  if (!factorize_without_pivoting()) return false;
   compute_bias();
   residual_ = J_dot_v + correction;
   y_ = u_tree - bias_tree + damping_tree;
-  sparse_->solve(y_, residual_, acceleration);
+  solve_by_factors(y_, residual_, acceleration);
   return true;
 }
 
 bool Core::elimination_step(In residual, Out x) {
   if (compiled) return compiled->closure_step(q_tree, residual, x);
-  if (!factorize_sparsely()) return false;
+  if (!factorize_without_pivoting()) return false;
   y_.setZero();
-  sparse_->solve(y_, residual, x);
+  solve_by_factors(y_, residual, x);
   return true;
 }
 
@@ -338,9 +363,8 @@ void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In fo
   const double acceleration_scale =
       std::max({a.cwiseQuotient(reach).lpNorm<Eigen::Infinity>(), fastest_rate * fastest_rate,
                 tree.spatial_gravity().head<3>().norm() / joints.table.size});
-  const Matrix& D = D_tree();
   force_bound_ = force.cwiseAbs();
-  for (int k = 0; k < n; ++k) force_bound_(k) += D(k, k) * reach(k) * acceleration_scale;
+  for (int k = 0; k < n; ++k) force_bound_(k) += joint_inertia(k) * reach(k) * acceleration_scale;
   bound.noalias() = columns.cwiseAbs().transpose() * force_bound_;
   bound *= acceleration_rounding_factor;
   for (size_t i = 0; i < at.size(); ++i)  // a body at rest still rotates at the rounding of its rate
@@ -351,11 +375,16 @@ void Core::acceleration_rounding(const Indices& at, const Matrix& columns, In fo
 bool Core::unit_force_responses(const Indices& at, Matrix& columns) {
   columns.resize(n, static_cast<Eigen::Index>(at.size()));
   residual_.setZero();
-  const bool is_sparse = factorize_sparsely();
-  if (!is_sparse && !find_tangent_basis(residual_, rank_lost_pivot)) return false;
-  if (!is_sparse) factorize_tangent_inertia();
-  if (is_sparse) sparse_->solve_unit_forces(at, columns);
-  for (size_t k = 0; k < at.size() && !is_sparse; ++k) {
+  if (factorize_without_pivoting()) {
+    if (articulated_)
+      articulated_->solve_unit_forces(at, columns);
+    else
+      sparse_->solve_unit_forces(at, columns);
+    return true;
+  }
+  if (!find_tangent_basis(residual_, rank_lost_pivot)) return false;
+  factorize_tangent_inertia();
+  for (size_t k = 0; k < at.size(); ++k) {
     y_.setUnit(at[k]);
     add_force_response(y_, columns.col(k));
   }

@@ -160,8 +160,6 @@ void ConstraintRows::update_relative_rotations(const Tree& tree) {
 void ConstraintRows::update_rates(const Tree& tree, In v) {
   const Closure& c = closure;
   for (size_t k = 0; k < c.curves.size(); ++k) curve_rates_(static_cast<Eigen::Index>(k)) = v(c.curves[k].coordinate);
-  for (int joint : joints_)
-    velocity_[joint] = tree.velocity(joint), acceleration_[joint] = tree.bias_acceleration(joint);
   for (size_t k = 0; k < p_.size(); ++k) {
     const Vector6& v = velocity_[c.point_joint[k]];
     p_dot_[k] = v.head<3>() + Vector3(v.tail<3>()).cross(p_[k]);

@@ -77,14 +77,20 @@ class ConstraintRows {
   std::vector<Indices> pattern_in(const Indices& columns, int n) const;
   void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
   void update_jacobian(const Tree& tree);
-  // Rates of the wrenches; requires the tree's velocities and accelerations at v.
-  void update_rates(const Tree& tree, In v);
+  // Rates of the wrenches; `motion` provides the joints' velocities and bias accelerations at v.
+  template <class Motion>
+  void update_rates(const Tree& tree, const Motion& motion, In v) {
+    for (int joint : joints_)
+      velocity_[joint] = motion.velocity(joint), acceleration_[joint] = motion.bias_acceleration(joint);
+    update_rates(tree, v);
+  }
   void update_jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
   void bias(Out J_dot_v) const;  // requires update_rates
   void multiply_J(In v, Out product) const;
   double J_norm() const;
 
  private:
+  void update_rates(const Tree& tree, In v);
   void update_relative_rotations(const Tree& tree);
   void update_relative_rotation_rates(const Tree& tree);
 

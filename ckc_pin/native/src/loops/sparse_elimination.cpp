@@ -148,6 +148,12 @@ void SparseElimination::solve(In force, In residual, Out a) {
   for (int k = 0; k < n_; ++k) a(k) = solution_(place_[k]) + residual_(place_[k]);
 }
 
+void SparseElimination::solve_without_rows(In force, Out a) {
+  for (int k = 0; k < n_; ++k) solution_(place_[k]) = force(k);
+  substitute(solution_);
+  for (int k = 0; k < n_; ++k) a(k) = solution_(place_[k]);
+}
+
 void SparseElimination::solve_unit_forces(const Indices& at, Matrix& columns) {
   solutions_.resize(solution_.size(), block_size), residuals_.resize(solution_.size(), block_size);
   const int count = static_cast<int>(at.size());

@@ -15,8 +15,6 @@ namespace {
 constexpr int width = Lanes::width;
 using Members = CompiledTerms::Members;
 
-// The numbers of all lanes as one vector. The compiler would vectorize loops over lanes along another loop.
-typedef double Vector8 __attribute__((vector_size(sizeof(Members)), may_alias));
 Vector8& vector_of(Members& x) { return reinterpret_cast<Vector8&>(x); }
 const Vector8& vector_of(const Members& x) { return reinterpret_cast<const Vector8&>(x); }
 

@@ -201,6 +201,8 @@ Matrix Tree::rotor_inertia() const {
   return inertia;
 }
 
+const Vector& Tree::armature() const { return workspace_->model.armature; }
+
 Vector6 Tree::spatial_gravity() const { return workspace_->model.gravity.toVector(); }
 
 static Eigen::Quaterniond orientation_of(In q, Tree::Root root) {

@@ -74,6 +74,8 @@ class Tree {
   Body body(int joint) const;  // in world axes, the inertia about the centre of mass
   // Constant part of D' (n, n): armatures, and rotors of motors on several joints.
   Matrix rotor_inertia() const;
+  const Vector& armature() const;  // (n)
+  bool has_shared_rotors() const { return rotors_.size() > 0; }
 
   // Operations on q'. A free root has a position and a unit quaternion, and moves by a twist in its own axes.
   void normalize(Out q) const;

@@ -7,3 +7,10 @@
 #else
 #define WITH_WIDEST_REGISTERS
 #endif
+
+namespace ckc {
+
+// Eight numbers as one vector. The compiler would vectorize loops over them along another loop, or not at all.
+typedef double Vector8 __attribute__((vector_size(8 * sizeof(double)), may_alias, aligned(sizeof(double))));
+
+}  // namespace ckc

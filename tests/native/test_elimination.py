@@ -1,4 +1,4 @@
-"""Sparse elimination of eq. 1 equals dense solutions, and its work grows in proportion to chains of loops."""
+"""Eliminations of eq. 1 without pivoting equal dense solutions, and their work grows in proportion to chains of loops."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from tests.property.mechanisms import closed_mechanism
 
 KINDS = ("point", "point_2d", "hinge", "cylindrical", "universal", "prismatic", "weld", "distance")
 TOLERANCE = 1e-11
+ELIMINATIONS = (_core.SparseElimination, _core.ArticulatedElimination)
 LINKS, LOOPS, MIN_JOINTS_IN_LOOP = 90, 6, 6  # of a random tree
 
 
@@ -77,9 +78,9 @@ def random_states(mechanism, count, seed, spread=0.1):
         yield Terms(mechanism, at, random.uniform(-1, 1, n)), random.uniform(-5, 5, n)
 
 
-def count_equal_to_dense(mechanism, count, seed):
+def count_equal_to_dense(mechanism, count, seed, kind):
     """Require equal accelerations at random states that need no pivoting, and return their number."""
-    elimination, solved = _core.SparseElimination(core_table(mechanism)), 0
+    elimination, solved = kind(core_table(mechanism)), 0
     for terms, u_tree in random_states(mechanism, count, seed):
         computed = elimination.acceleration(terms.q_tree, terms.v_tree, u_tree)
         if computed is not None:
@@ -88,19 +89,56 @@ def count_equal_to_dense(mechanism, count, seed):
     return solved
 
 
+@pytest.mark.parametrize("elimination", ELIMINATIONS)
 @pytest.mark.parametrize("name", shipped())
-def test_shipped_mechanisms_equal_a_dense_solution(name):
+def test_shipped_mechanisms_equal_a_dense_solution(name, elimination):
     mechanism = load(name)
-    assert count_equal_to_dense(mechanism, 50, seed=0) >= 45
+    assert count_equal_to_dense(mechanism, 50, 0, elimination) >= 45
 
 
+@pytest.mark.parametrize("elimination", ELIMINATIONS)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "variant", [{}, {"free": False}, {"redundant": True}, {"nonlinear": True}, {"rows_in": "world"}]
 )
-def test_random_loops_equal_a_dense_solution(kind, variant):
+def test_random_loops_equal_a_dense_solution(kind, variant, elimination):
     closed = closed_mechanism(kind, seed=12, **variant)
-    assert count_equal_to_dense(closed.mechanism, 20, seed=1) >= 15
+    assert count_equal_to_dense(closed.mechanism, 20, 1, elimination) >= 15
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_bodies_move_and_press_as_those_of_pinocchio(free):
+    """Of a random tree 1 km from the world's origin: bias forces, velocities and accelerations at zero v_dot."""
+    mechanism = random_tree(3, free=free)
+    elimination, model = _core.ArticulatedElimination(core_table(mechanism)), mechanism.tree.model
+    data, random = model.createData(), np.random.default_rng(0)
+    for _ in range(5):
+        q_tree = mechanism.tree.integrate(mechanism.q_tree, random.uniform(-1, 1, mechanism.n))
+        if free:
+            q_tree[:3] = 1000.0, -200.0, 300.0
+        v_tree = random.uniform(-1, 1, mechanism.n)
+        bias, velocities, accelerations = elimination.motion(q_tree, v_tree)
+        assert relative_error(bias, pin.nonLinearEffects(model, data, q_tree, v_tree)) <= TOLERANCE
+        pin.forwardKinematics(model, data, q_tree, v_tree, np.zeros(mechanism.n))
+        for joint in range(1, model.njoints):
+            to_world = data.oMi[joint].toActionMatrix()
+            for computed, motion in ((velocities, data.v[joint]), (accelerations, data.a[joint])):
+                expected = to_world @ motion.vector
+                assert np.abs(computed[:, joint] - expected).max() <= TOLERANCE * (1 + np.abs(expected).max())
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_unit_forces_accelerate_as_in_a_dense_solution(free):
+    mechanism = random_tree(4, free=free)
+    elimination, n = _core.ArticulatedElimination(core_table(mechanism)), mechanism.n
+    at = [int(k) for k in np.random.default_rng(1).choice(n, 19, replace=False)]
+    terms = Terms(mechanism, mechanism.kinematics(mechanism.q_tree), np.zeros(n))
+    free_fall = dense_acceleration(terms, np.zeros(n))
+    responses = elimination.unit_force_responses(mechanism.q_tree, at)
+    assert responses is not None
+    for k, response in zip(at, responses.T, strict=True):
+        expected = dense_acceleration(terms, 1e3 * np.eye(n)[k]) - free_fall
+        assert np.abs(1e3 * response - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -174,11 +212,11 @@ def test_a_small_pivot_falls_back_to_projection():
     """Loads of 10,000 tonnes hang on chains of light rods, whose own inertia is a difference of large numbers."""
     mechanism = pendulums([1.0] * 3 + [1e7], chains=6)
     table = core_table(mechanism)
-    eliminating, projecting, elimination = _core.Core(table), _core.Core(table), _core.SparseElimination(table)
+    eliminating, projecting, eliminations = _core.Core(table), _core.Core(table), [kind(table) for kind in ELIMINATIONS]
     projecting.allow_elimination(False)
     assert eliminating.has_elimination
     for terms, u_tree in random_states(mechanism, 5, seed=3):
-        assert elimination.acceleration(terms.q_tree, terms.v_tree, u_tree) is None
+        assert all(of.acceleration(terms.q_tree, terms.v_tree, u_tree) is None for of in eliminations)
         state = terms.q_tree, terms.v_tree, u_tree, np.zeros(0)
         np.testing.assert_array_equal(eliminating.dae_acceleration(*state), projecting.dae_acceleration(*state))
 
@@ -186,10 +224,11 @@ def test_a_small_pivot_falls_back_to_projection():
 def test_dependent_rows_are_detected():
     """The squares stand upright, where the loops lose rank."""
     mechanism = build(*generate(GeneratorSpec(generator="n_four_bar", N=3)))
-    elimination, n = _core.SparseElimination(core_table(mechanism)), mechanism.n
+    n = mechanism.n
     flat = mechanism.tree.integrate(mechanism.q_tree, np.where(np.arange(n) <= 3, -np.pi / 2, np.pi / 2))
-    assert elimination.acceleration(mechanism.q_tree, np.zeros(n), np.zeros(n)) is not None
-    assert elimination.acceleration(flat, np.zeros(n), np.zeros(n)) is None
+    for elimination in [kind(core_table(mechanism)) for kind in ELIMINATIONS]:
+        assert elimination.acceleration(mechanism.q_tree, np.zeros(n), np.zeros(n)) is not None
+        assert elimination.acceleration(flat, np.zeros(n), np.zeros(n)) is None
 
 
 def test_rods_with_sticking_joints_move_as_one_rod():
@@ -231,9 +270,9 @@ def test_elimination_of_deep_chains_is_as_exact_as_projection() -> None:
         A = mpmath.matrix(np.block([[terms.D_tree, J.T], [J, np.zeros((len(J), len(J)))]]).tolist())
         right = mpmath.matrix(np.concatenate([-terms.bias_tree, -terms.at.J_dot(v_tree) @ v_tree]).tolist())
         exact = np.array([float(x) for x in mpmath.lu_solve(A, right)[:n]])
-    elimination = _core.SparseElimination(core_table(mechanism))
-    eliminated = elimination.acceleration(mechanism.q_tree, v_tree, np.zeros(n))
-    assert eliminated is not None
     projected = dae_acceleration(terms, np.zeros(n))
-    assert relative_error(eliminated, exact) < 5e-10
-    assert relative_error(eliminated, exact) < 3 * relative_error(projected, exact)
+    for kind in ELIMINATIONS:
+        eliminated = kind(core_table(mechanism)).acceleration(mechanism.q_tree, v_tree, np.zeros(n))
+        assert eliminated is not None
+        assert relative_error(eliminated, exact) < 5e-10
+        assert relative_error(eliminated, exact) < 3 * relative_error(projected, exact)

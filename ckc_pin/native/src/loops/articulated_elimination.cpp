@@ -1,0 +1,152 @@
+#include "loops/articulated_elimination.hpp"
+
+#include <algorithm>
+#include <map>
+#include <set>
+
+#include "loops/rows.hpp"
+
+namespace ckc {
+
+ArticulatedElimination::ArticulatedElimination(const Tree& tree, const ConstraintRows& rows, Indices kept)
+    : bodies(tree), kept_(std::move(kept)) {
+  const int count = static_cast<int>(kept_.size());
+  std::map<Indices, Indices> rows_by_coordinates;
+  for (int i = 0; i < count; ++i) {
+    std::set<int> moved;
+    for (int j : rows.relative_pattern[kept_[i]]) moved.insert(tree.ancestors[j].begin(), tree.ancestors[j].end());
+    rows_by_coordinates[Indices(moved.begin(), moved.end())].push_back(i);
+  }
+  for (const auto& [coordinates, of] : rows_by_coordinates)
+    for (size_t first = 0; first < of.size(); first += block_size) {
+      Group group;
+      group.rows.assign(of.begin() + first, of.begin() + std::min(first + block_size, of.size()));
+      group.coordinates = coordinates;
+      for (size_t l = 0; l < group.rows.size(); ++l) {
+        const int row = kept_[group.rows[l]];
+        for (int j : rows.relative_pattern[row]) {
+          const auto place = std::lower_bound(coordinates.begin(), coordinates.end(), j) - coordinates.begin();
+          group.entries.push_back({static_cast<int>(place * block_size + l), row, j, 0.0});
+        }
+      }
+      group.innovations.resize(static_cast<Eigen::Index>(coordinates.size()), block_size);
+      visits_ += static_cast<long>(coordinates.size());
+      groups_.push_back(std::move(group));
+    }
+  std::vector<Indices> pattern(count);
+  for (int a = 0; a < static_cast<int>(groups_.size()); ++a)
+    for (int b = a; b < static_cast<int>(groups_.size()); ++b) {
+      Pair pair{a, b, {}};
+      const Indices &of_a = groups_[a].coordinates, &of_b = groups_[b].coordinates;
+      for (size_t i = 0, j = 0; i < of_a.size() && j < of_b.size();) {
+        if (of_a[i] == of_b[j]) pair.places.emplace_back(i, j);
+        const bool advance_a = of_a[i] <= of_b[j], advance_b = of_b[j] <= of_a[i];
+        i += advance_a, j += advance_b;
+      }
+      if (pair.places.empty()) continue;
+      visits_ += static_cast<long>(pair.places.size());
+      for (int i : groups_[a].rows)
+        for (int j : groups_[b].rows)
+          if (a != b || i <= j) pattern[std::max(i, j)].push_back(std::min(i, j));
+      pairs_.push_back(std::move(pair));
+    }
+  rows_ = std::make_unique<SparseElimination>(pattern, std::vector<Indices>(), Indices());
+  operations_ = rows_->operations();
+  row_matrix_.setZero(count, count);
+  rates_.setZero(count), multipliers_.setZero(count), residual_.setZero(count);
+  x_.setZero(tree.n), a_.setZero(tree.n), correction_.setZero(tree.n);
+}
+
+bool ArticulatedElimination::compute(const Matrix& J) {
+  if (!bodies.factorize()) return false;
+  for (Group& group : groups_) {
+    group.innovations.setZero();
+    double* const innovations = group.innovations.data();
+    for (Group::Entry& entry : group.entries) innovations[entry.place] = entry.value = J(entry.row, entry.column);
+    bodies.eliminate(group.coordinates, group.innovations);
+  }
+  for (const Pair& pair : pairs_) {
+    const Group &a = groups_[pair.a], &b = groups_[pair.b];
+    const auto rows = static_cast<int>(a.rows.size()), columns = static_cast<int>(b.rows.size());
+    double products[block_size][block_size] = {};
+    for (const auto& [of_a, of_b] : pair.places) {
+      const double inverse = bodies.inverse_pivot(a.coordinates[of_a]);
+      const double* const left = a.innovations.data() + static_cast<ptrdiff_t>(of_a) * block_size;
+      const double* const right = b.innovations.data() + static_cast<ptrdiff_t>(of_b) * block_size;
+      for (int i = 0; i < rows; ++i) {
+        const double factor = left[i] * inverse;
+        for (int j = 0; j < block_size; ++j) products[i][j] += factor * right[j];
+      }
+    }
+    for (int i = 0; i < rows; ++i)
+      for (int j = 0; j < columns; ++j) {
+        const auto [first, last] = std::minmax(a.rows[i], b.rows[j]);
+        row_matrix_(first, last) = products[i][j];
+      }
+  }
+  return rows_->compute(row_matrix_, no_rows_);
+}
+
+// x += L^-1 J^T lambda, with the multipliers lambda that change the accelerations of the rows by `rates`.
+template <int size>
+void ArticulatedElimination::add_row_forces(const Block<size>& rates, Block<size>& x) {
+  for (int l = 0; l < size; ++l) {
+    rates_ = rates.col(l);
+    rows_->solve_without_rows(rates_, multipliers_);
+    for (const Group& group : groups_)
+      for (size_t place = 0; place < group.coordinates.size(); ++place) {
+        double sum = 0.0;
+        for (size_t i = 0; i < group.rows.size(); ++i)
+          sum += group.innovations(static_cast<Eigen::Index>(place), static_cast<Eigen::Index>(i)) *
+                 multipliers_(group.rows[i]);
+        x(group.coordinates[place], l) += sum;
+      }
+  }
+}
+
+// Solve for several forces x, with J a = -residual, and refine once: J D'^-1 J^T has the square of J's condition number.
+template <int size>
+void ArticulatedElimination::solve_block(Block<size>& x, const Block<size>& residual, Block<size>& a) {
+  bodies.eliminate(bodies.all(), x);
+  Block<size> rates = -residual;
+  for (const Group& group : groups_)
+    for (size_t place = 0; place < group.coordinates.size(); ++place) {
+      const int k = group.coordinates[place];
+      for (size_t i = 0; i < group.rows.size(); ++i)
+        rates.row(group.rows[i]) -= group.innovations(static_cast<Eigen::Index>(place), static_cast<Eigen::Index>(i)) *
+                                    bodies.inverse_pivot(k) * x.row(k);
+    }
+  add_row_forces(rates, x);
+  bodies.accelerate(x, a);
+  rates = -residual;
+  for (const Group& group : groups_)
+    for (const Group::Entry& entry : group.entries)
+      rates.row(group.rows[static_cast<size_t>(entry.place % block_size)]) -= entry.value * a.row(entry.column);
+  x.setZero();
+  add_row_forces(rates, x);
+  Block<size> correction(a.rows(), size);
+  bodies.accelerate(x, correction);
+  a += correction;
+}
+
+void ArticulatedElimination::solve(In force, In residual, Out a) {
+  x_ = force;
+  for (size_t i = 0; i < kept_.size(); ++i) residual_(static_cast<Eigen::Index>(i)) = residual(kept_[i]);
+  solve_block<1>(x_, residual_, a_);
+  a = a_;
+}
+
+void ArticulatedElimination::solve_unit_forces(const Indices& at, Matrix& columns) {
+  const int count = static_cast<int>(at.size());
+  const Block<block_size> residual = Block<block_size>::Zero(static_cast<Eigen::Index>(kept_.size()), block_size);
+  Block<block_size> x(columns.rows(), block_size), a(columns.rows(), block_size);
+  for (int first = 0; first < count; first += block_size) {
+    const int last = std::min(first + block_size, count);
+    x.setZero();
+    for (int j = first; j < last; ++j) x(at[j], j - first) = 1.0;
+    solve_block<block_size>(x, residual, a);
+    columns.middleCols(first, last - first) = a.leftCols(last - first);
+  }
+}
+
+}  // namespace ckc

@@ -1,0 +1,68 @@
+// Elimination of eq. 1 by articulated bodies, without D': J D'^-1 J^T is computed from one sweep through the tree for
+// every eight rows, and factorized.
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "loops/sparse_elimination.hpp"
+#include "tree/articulated_bodies.hpp"
+
+namespace ckc {
+
+class ConstraintRows;
+
+class ArticulatedElimination {
+ public:
+  // `kept`: independent rows of J; the others are left out.
+  ArticulatedElimination(const Tree& tree, const ConstraintRows& rows, Indices kept);
+
+  // Number of coordinates that all sweeps visit, and multiplications of the factorization of J D'^-1 J^T.
+  long visits() const { return visits_; }
+  long operations() const { return operations_; }
+  // Move the bodies to the tree's configuration.
+  void set_configuration(const Tree& tree) { bodies.set_configuration(tree); }
+  // Factorize, at the bodies' configuration. False if a pivot is so small that digits are lost.
+  bool compute(const Matrix& J);
+  // As those of SparseElimination.
+  void solve(In force, In residual, Out a);
+  void solve_unit_forces(const Indices& at, Matrix& columns);
+
+  ArticulatedBodies bodies;
+
+ private:
+  template <int size>
+  using Block = ArticulatedBodies::Block<size>;
+  static constexpr int block_size = ArticulatedBodies::block_size;
+  // Rows of J that move the same coordinates, up to eight.
+  struct Group {
+    Indices rows;  // among the kept ones
+    Indices coordinates;  // on which the rows' forces act, and those above them; ascending
+    struct Entry {
+      int place, row, column;  // of the transposed block, of J
+      double value;
+    };
+    std::vector<Entry> entries;
+    Block<block_size> innovations;  // L^-1 J^T
+  };
+  // Two groups with common coordinates, and the places of these in both.
+  struct Pair {
+    int a, b;
+    std::vector<std::pair<int, int>> places;
+  };
+  template <int size>
+  void solve_block(Block<size>& x, const Block<size>& residual, Block<size>& a);
+  template <int size>
+  void add_row_forces(const Block<size>& rates, Block<size>& x);
+
+  Indices kept_;
+  std::vector<Group> groups_;
+  std::vector<Pair> pairs_;
+  std::unique_ptr<SparseElimination> rows_;
+  Matrix row_matrix_, no_rows_;  // upper triangle of J D'^-1 J^T
+  long visits_ = 0, operations_ = 0;
+  Vector rates_, multipliers_;
+  Block<1> x_, a_, correction_, residual_;
+};
+
+}  // namespace ckc
