@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from random import Random
 
 import numpy as np
 
@@ -163,10 +164,10 @@ def _minimum_norm_solution(jacobian: Array, phi: Array) -> Array:
 
 def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
     """Return closed configurations a small step along the tangent space, if there are any."""
-    random = np.random.default_rng(0)
+    random = Random(0)  # a check of every mechanism: NumPy's generators take longer to import than the check
     configurations = []
     for _ in range(NEARBY_COUNT if len(tangent) else 0):
-        step = random.uniform(-1.0, 1.0, len(tangent)) @ tangent
+        step = np.array([random.uniform(-1.0, 1.0) for _ in tangent]) @ tangent
         step *= NEARBY_STEP / np.abs(step).max() * tree.step_scale
         closed = close_loops(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
         if closed.residual <= 10 * accept:

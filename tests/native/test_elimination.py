@@ -1,4 +1,4 @@
-"""Eliminations of eq. 1 without pivoting equal dense solutions, and their work grows in proportion to chains of loops."""
+"""Eliminations of eq. 1 without pivoting equal dense solutions; their work grows in proportion to chains of loops."""
 
 from __future__ import annotations
 

@@ -14,10 +14,9 @@ namespace ckc {
 // nonzero entries than the second.
 constexpr int max_sparse_size = 12;
 constexpr double min_dense_share = 0.2;
-// Durations in units of a multiplication in projection, which works on dense columns: of one in sparse elimination, which
-// takes 3 to 4 units when repeated (in a run, where other code follows, the processor predicts its short loops badly),
-// and of a visit of a coordinate by the sweeps of articulated bodies.
-constexpr double sparse_cost = 6.0, visit_cost = 100.0;
+// Durations in units of a multiplication in projection, which works on dense columns: of one in sparse elimination, and
+// of a visit of a coordinate by the sweeps of articulated bodies.
+constexpr double sparse_cost = 3.0, visit_cost = 60.0;
 
 Core::Core(CoreTable table)
     : tree(table.model, std::move(table.q_index)),
@@ -38,7 +37,7 @@ Core::Core(CoreTable table)
   C_tree_.setZero(n, n), damping_tree.setZero(n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   unbalanced_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
-  tangent_.setZero(n, n - rank), D_tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
+  tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);
   tangent_matrix_.setZero(n - rank, n - rank), tangent_factor_.resize(n - rank);
   rho_times_x_.setZero(n), tangent_solution_.setZero(n - rank), tangent_rhs_.setZero(n - rank);
   if (table.rotors.size()) tree.set_parameters(Tree::Parameter::rotors, table.rotors);
@@ -48,14 +47,15 @@ Core::Core(CoreTable table)
   choose_elimination();
 }
 
-// Use elimination if it costs less than projection: D' T, T^T D' T and its Cholesky factorization.
+// Use elimination if it costs less than projection: T^T D' T and its Cholesky factorization.
 void Core::choose_elimination() {
   sparse_.reset(), articulated_.reset();
   const double size = n, d = n - rank;
   if (compiled || n <= max_sparse_size || static_cast<int>(independent_rows_.size()) != rank) return;
   double inertia_entries = 0.0;
   for (const Indices& rows : tree.inertia_pattern) inertia_entries += 2.0 * static_cast<double>(rows.size()) - 1.0;
-  const double projection = d * (D_tree_is_dense_ ? size * size : inertia_entries) + size * d * d + d * d * d / 6.0;
+  const double products = D_tree_is_dense_ ? rank * size * d : d * inertia_entries + size * d * d;
+  const double projection = products + d * d * d / 6.0;
   if (projection < sparse_cost * size) return;
   auto sparse = std::make_unique<SparseElimination>(tree.inertia_pattern, constraints.relative_pattern, independent_rows_);
   const double in_matrices = sparse_cost * static_cast<double>(sparse->operations());
@@ -78,7 +78,7 @@ void Core::set_partition(Indices q_, Indices z_) {
   phi_z.set_pattern(m, k, pattern), basis_.set_pattern(m, k, pattern);
   basis_q_ = q, basis_z_ = z, basis_configuration_ = -1;
   D_factor.resize(d);
-  rho.setZero(n, d), D_rho_.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
+  rho.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
 }
 
 Eigen::Index Core::parameter_size(Parameter parameter) const {
@@ -205,16 +205,39 @@ void Core::compute_D() {
   if (is_valid(inertia_of_q)) return;
   compute_D_tree(), compute_rho();
   Profile::Entry entry(profile, Profile::D);
-  if (D_tree_is_dense_) {
-    D_rho_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * rho;
-    D.noalias() = rho.transpose() * D_rho_;
-  } else {
-    for (int k = 0; k < d; ++k) multiply_D_tree(rho.col(k), D_rho_.col(k));
-    for (int i = 0; i < d; ++i)
-      for (int k = 0; k < d; ++k) D(i, k) = rho.col(i).dot(D_rho_.col(k));
-  }
+  restrict_inertia(q, rho, D);
   D_factor.compute(D);
   valid_parts_ |= inertia_of_q;
+}
+
+// basis^T D' basis, where the rows of the independent coordinates are those of the identity.
+void Core::restrict_inertia(const Indices& independent, const Matrix& basis, Matrix& restricted) {
+  const auto count = static_cast<int>(independent.size());
+  if (!D_tree_is_dense_) {
+    D_basis_.resize(n, count);
+    for (int k = 0; k < count; ++k) multiply_D_tree(basis.col(k), D_basis_.col(k));
+    for (int i = 0; i < count; ++i)
+      for (int k = 0; k < count; ++k) restricted(i, k) = basis.col(i).dot(D_basis_.col(k));
+    return;
+  }
+  // [1; S]^T [A, B; B^T, C] [1; S] = A + X + X^T with X = (B + S^T C / 2) S
+  dependent_.clear();
+  for (int k = 0; k < n; ++k)
+    if (std::find(independent.begin(), independent.end(), k) == independent.end()) dependent_.push_back(k);
+  const Matrix& D = D_tree();
+  const auto entry = [&D](int i, int j) { return i <= j ? D(i, j) : D(j, i); };
+  const int others = n - count;
+  dependent_basis_.resize(others, count), D_dependent_.resize(others, others), D_between_.resize(count, others);
+  for (int j = 0; j < others; ++j) {
+    dependent_basis_.row(j) = basis.row(dependent_[j]);
+    for (int i = 0; i < others; ++i) D_dependent_(i, j) = 0.5 * entry(dependent_[i], dependent_[j]);
+    for (int i = 0; i < count; ++i) D_between_(i, j) = entry(independent[i], dependent_[j]);
+  }
+  D_between_.noalias() += dependent_basis_.transpose() * D_dependent_;
+  D_basis_.noalias() = D_between_ * dependent_basis_;
+  for (int j = 0; j < count; ++j)
+    for (int i = 0; i < count; ++i)
+      restricted(i, j) = entry(independent[i], independent[j]) + (D_basis_(i, j) + D_basis_(j, i));
 }
 
 void Core::multiply_D_tree(In x, Out product) const {

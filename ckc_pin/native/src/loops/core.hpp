@@ -249,6 +249,7 @@ class Core {
   void update_spring_lengths();
   void compute_spring_forces();                            // into elastic_
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
+  void restrict_inertia(const Indices& independent, const Matrix& basis, Matrix& restricted);
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
   bool inertia_metric_step(In residual, double min_pivot, Out x);  // `closure_step` in the metric of D' only
@@ -280,7 +281,9 @@ class Core {
   // `configuration_count` of the last factorization without pivoting, and of the bodies' placement
   long factors_configuration_ = -1, bodies_configuration_ = -1;
   unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
-  Matrix C_tree_, D_compiled_, D_rho_, tangent_, D_tangent_;
+  Matrix C_tree_, D_compiled_, tangent_;
+  Matrix D_basis_, dependent_basis_, D_dependent_, D_between_;  // of `restrict_inertia`
+  Indices dependent_;
   Indices basis_coordinates_;           // by column of the tangent basis: its coordinate
   Indices basis_q_, basis_z_, pivots_;  // partition of the tangent basis; independent of q and z
   Factor basis_;

@@ -115,11 +115,7 @@ bool Core::find_tangent_basis(In residual, double min_pivot) {
 void Core::factorize_tangent_inertia() {
   if (inertia_configuration_ == configuration_count && basis_configuration_ == configuration_count) return;
   compute_D_tree();
-  if (D_tree_is_dense_)
-    D_tangent_.noalias() = D_tree().selfadjointView<Eigen::Upper>() * tangent_;
-  else
-    for (int k = 0; k < n - rank; ++k) multiply_D_tree(tangent_.col(k), D_tangent_.col(k));
-  tangent_matrix_.noalias() = tangent_.transpose() * D_tangent_;
+  restrict_inertia(basis_coordinates_, tangent_, tangent_matrix_);
   tangent_factor_.compute(tangent_matrix_);
   inertia_configuration_ = basis_configuration_;
 }
