@@ -769,6 +769,12 @@ class ArticulatedElimination:
         Return C'v + h' without springs, and the joints' velocities and bias accelerations, one column each, in world axes at the world's origin.
         """
 
+    @property
+    def operations(self) -> int:
+        """
+        Coordinates that all sweeps visit, and multiplications with the matrix of the rows.
+        """
+
 class Turn:
     """Holds a gate's lock within a `with` block."""
 

@@ -250,13 +250,14 @@ def test_rods_with_sticking_joints_move_as_one_rod():
     assert np.abs(run.q_tree[:, 1:]).max() <= 1e-12
 
 
+@pytest.mark.parametrize("elimination", ELIMINATIONS)
 @pytest.mark.parametrize("loops", ["all", 1])
-def test_work_grows_in_proportion_to_the_number_of_squares(loops, tmp_path):
+def test_work_grows_in_proportion_to_the_number_of_squares(loops, elimination, tmp_path):
     work = {}
     for N in (5, 10, 20, 40):
         write_case(Case(N, N if loops == "all" else loops), tmp_path)
         mechanism = load(tmp_path / "mechanism.toml")
-        work[N] = _core.SparseElimination(core_table(mechanism)).operations
+        work[N] = elimination(core_table(mechanism)).operations
     assert exponent(work, whole=True) <= 1.05
 
 

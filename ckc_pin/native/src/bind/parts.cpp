@@ -208,7 +208,12 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
            "Return the accelerations that unit forces on coordinates cause, one column each; None if a pivot is small.")
       .def("motion", &BoundArticulatedElimination::motion, "q_tree"_a, "v_tree"_a,
            "Return C'v + h' without springs, and the joints' velocities and bias accelerations, one column each, in "
-           "world axes at the world's origin.");
+           "world axes at the world's origin.")
+      .def_prop_ro("operations",
+                   [](const BoundArticulatedElimination& of) {
+                     return of.core->n + of.elimination.visits() + of.elimination.operations();
+                   },
+                   "Coordinates that all sweeps visit, and multiplications with the matrix of the rows.");
   binding
       .def("rank", &rank, "y"_a,
            "Return the rank monitor's smallest singular value of J and its rate at a DAE's state.")

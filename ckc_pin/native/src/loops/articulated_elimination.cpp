@@ -5,8 +5,27 @@
 #include <set>
 
 #include "loops/rows.hpp"
+#include "tree/widest_registers.hpp"
 
 namespace ckc {
+
+constexpr int block_size = ArticulatedBodies::block_size;
+using Places = std::vector<std::pair<int, int>>;
+
+static const Vector8& row_of(const double* block, int place) {
+  return *reinterpret_cast<const Vector8*>(block + static_cast<ptrdiff_t>(place) * block_size);
+}
+
+// Products of columns of L^-1 J^T of two groups of rows, divided by the pivots of the coordinates at these places.
+WITH_WIDEST_REGISTERS static void multiply_innovations(const double* a, const double* b, const Places& places,
+                                                       const double* inverse_pivots, int rows, double* products) {
+  Vector8 sums[block_size] = {};
+  for (size_t k = 0; k < places.size(); ++k) {
+    const double* const row = a + static_cast<ptrdiff_t>(places[k].first) * block_size;
+    for (int i = 0; i < rows; ++i) sums[i] += row_of(b, places[k].second) * (row[i] * inverse_pivots[k]);
+  }
+  for (int i = 0; i < rows; ++i) reinterpret_cast<Vector8*>(products)[i] = sums[i];
+}
 
 ArticulatedElimination::ArticulatedElimination(const Tree& tree, const ConstraintRows& rows, Indices kept)
     : bodies(tree), kept_(std::move(kept)) {
@@ -52,7 +71,7 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
     }
   rows_ = std::make_unique<SparseElimination>(pattern, std::vector<Indices>(), Indices());
   operations_ = rows_->operations();
-  row_matrix_.setZero(count, count);
+  inverse_pivots_.resize(tree.n), row_matrix_.setZero(count, count);
   rates_.setZero(count), multipliers_.setZero(count), residual_.setZero(count);
   x_.setZero(tree.n), a_.setZero(tree.n), correction_.setZero(tree.n);
 }
@@ -68,16 +87,10 @@ bool ArticulatedElimination::compute(const Matrix& J) {
   for (const Pair& pair : pairs_) {
     const Group &a = groups_[pair.a], &b = groups_[pair.b];
     const auto rows = static_cast<int>(a.rows.size()), columns = static_cast<int>(b.rows.size());
-    double products[block_size][block_size] = {};
-    for (const auto& [of_a, of_b] : pair.places) {
-      const double inverse = bodies.inverse_pivot(a.coordinates[of_a]);
-      const double* const left = a.innovations.data() + static_cast<ptrdiff_t>(of_a) * block_size;
-      const double* const right = b.innovations.data() + static_cast<ptrdiff_t>(of_b) * block_size;
-      for (int i = 0; i < rows; ++i) {
-        const double factor = left[i] * inverse;
-        for (int j = 0; j < block_size; ++j) products[i][j] += factor * right[j];
-      }
-    }
+    for (size_t k = 0; k < pair.places.size(); ++k)
+      inverse_pivots_[k] = bodies.inverse_pivot(a.coordinates[pair.places[k].first]);
+    double products[block_size][block_size];
+    multiply_innovations(a.innovations.data(), b.innovations.data(), pair.places, inverse_pivots_.data(), rows, products[0]);
     for (int i = 0; i < rows; ++i)
       for (int j = 0; j < columns; ++j) {
         const auto [first, last] = std::minmax(a.rows[i], b.rows[j]);
@@ -93,14 +106,15 @@ void ArticulatedElimination::add_row_forces(const Block<size>& rates, Block<size
   for (int l = 0; l < size; ++l) {
     rates_ = rates.col(l);
     rows_->solve_without_rows(rates_, multipliers_);
-    for (const Group& group : groups_)
+    for (const Group& group : groups_) {
+      double multipliers[block_size] = {};
+      for (size_t i = 0; i < group.rows.size(); ++i) multipliers[i] = multipliers_(group.rows[i]);
       for (size_t place = 0; place < group.coordinates.size(); ++place) {
-        double sum = 0.0;
-        for (size_t i = 0; i < group.rows.size(); ++i)
-          sum += group.innovations(static_cast<Eigen::Index>(place), static_cast<Eigen::Index>(i)) *
-                 multipliers_(group.rows[i]);
-        x(group.coordinates[place], l) += sum;
+        const Vector8 products = row_of(group.innovations.data(), static_cast<int>(place)) * row_of(multipliers, 0);
+        x(group.coordinates[place], l) += ((products[0] + products[1]) + (products[2] + products[3])) +
+                                          ((products[4] + products[5]) + (products[6] + products[7]));
       }
+    }
   }
 }
 
@@ -110,11 +124,13 @@ void ArticulatedElimination::solve_block(Block<size>& x, const Block<size>& resi
   bodies.eliminate(bodies.all(), x);
   Block<size> rates = -residual;
   for (const Group& group : groups_)
-    for (size_t place = 0; place < group.coordinates.size(); ++place) {
-      const int k = group.coordinates[place];
-      for (size_t i = 0; i < group.rows.size(); ++i)
-        rates.row(group.rows[i]) -= group.innovations(static_cast<Eigen::Index>(place), static_cast<Eigen::Index>(i)) *
-                                    bodies.inverse_pivot(k) * x.row(k);
+    for (int l = 0; l < size; ++l) {
+      Vector8 sums = {};
+      for (size_t place = 0; place < group.coordinates.size(); ++place) {
+        const int k = group.coordinates[place];
+        sums += row_of(group.innovations.data(), static_cast<int>(place)) * (bodies.inverse_pivot(k) * x(k, l));
+      }
+      for (size_t i = 0; i < group.rows.size(); ++i) rates(group.rows[i], l) -= sums[i];
     }
   add_row_forces(rates, x);
   bodies.accelerate(x, a);

@@ -20,8 +20,6 @@ class ArticulatedElimination {
   // Number of coordinates that all sweeps visit, and multiplications of the factorization of J D'^-1 J^T.
   long visits() const { return visits_; }
   long operations() const { return operations_; }
-  // Move the bodies to the tree's configuration.
-  void set_configuration(const Tree& tree) { bodies.set_configuration(tree); }
   // Factorize, at the bodies' configuration. False if a pivot is so small that digits are lost.
   bool compute(const Matrix& J);
   // As those of SparseElimination.
@@ -36,7 +34,7 @@ class ArticulatedElimination {
   static constexpr int block_size = ArticulatedBodies::block_size;
   // Rows of J that move the same coordinates, up to eight.
   struct Group {
-    Indices rows;  // among the kept ones
+    Indices rows;         // among the kept ones
     Indices coordinates;  // on which the rows' forces act, and those above them; ascending
     struct Entry {
       int place, row, column;  // of the transposed block, of J
@@ -61,6 +59,7 @@ class ArticulatedElimination {
   std::unique_ptr<SparseElimination> rows_;
   Matrix row_matrix_, no_rows_;  // upper triangle of J D'^-1 J^T
   long visits_ = 0, operations_ = 0;
+  std::vector<double> inverse_pivots_;  // of a pair's places
   Vector rates_, multipliers_;
   Block<1> x_, a_, correction_, residual_;
 };

@@ -95,8 +95,9 @@ WITH_WIDEST_REGISTERS bool factorize_bodies(std::vector<Coordinate>& coordinates
       if (is_leaf[at->joint]) inertia = {};
       add(bodies[at->joint], inertia);
     }
-    Vector8 force{};
-    for (int c = 0; c < 6; ++c) force += vector_of(inertia.column[c].x) * at->axis.x[entry[c]];
+    Vector8 product[6];
+    for (int c = 0; c < 6; ++c) product[c] = vector_of(inertia.column[c].x) * at->axis.x[entry[c]];
+    const Vector8 force = ((product[0] + product[1]) + (product[2] + product[3])) + (product[4] + product[5]);
     vector_of(at->force.x) = force;
     const double pivot = dot(at->axis, at->force) + at->armature;
     const RigidBody& composite = composites[at->joint];

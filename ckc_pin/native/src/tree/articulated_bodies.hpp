@@ -25,11 +25,11 @@ class ArticulatedBodies {
     Spatial column[6];
   };
   struct Coordinate {
-    int joint, parent;          // the parent of the joint
-    bool is_first, is_last;     // of its joint
-    double armature, inertia;   // of all that the coordinate moves: D'(k, k)
-    double inverse;             // of the pivot
-    Spatial axis, force;        // force: articulated inertia times axis
+    int joint, parent;         // the parent of the joint
+    bool is_first, is_last;    // of its joint
+    double armature, inertia;  // of all that the coordinate moves: D'(k, k)
+    double inverse;            // of the pivot
+    Spatial axis, force;       // force: articulated inertia times axis
   };
   struct RigidBody {
     double mass;
@@ -69,8 +69,8 @@ class ArticulatedBodies {
   // Inertias of the bodies behind a joint, of which all joints have been eliminated. A joint and the last one behind it
   // share theirs, so that a chain has a single one.
   std::vector<SpatialInertia> articulated_;
-  Indices place_;                 // by joint: in articulated_
-  std::vector<char> is_leaf_;     // by joint
+  Indices place_;              // by joint: in articulated_
+  std::vector<char> is_leaf_;  // by joint
   Indices all_;
   Vector3 gravity_, reference_;
   std::vector<Spatial> carried_;  // by joint: six rows of forces or motions
