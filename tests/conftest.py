@@ -128,8 +128,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage from now on, but not among the tests, which would take a quarter of the time to collect them."""
+    """Collect garbage from now on, but not among the tests, which would take a quarter of the time to collect them.
+
+    Python's own thresholds, 700, 10 and 10, take tests of figures 5 % more processor time, and tests of runs 1 % more.
+    """
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
     gc.enable()
 
 
