@@ -14,7 +14,7 @@ from ckc_pin.view.style import figure_style
 
 LIMIT = 5.0  # N m
 PLACES = np.array([[0.0, 0.0, -0.29], [0.0, 0.0, -0.27], [0.1, 0.0, -0.27], [0.1, 0.0, -0.29]])  # m
-INSTANTS = 600
+INSTANTS = 300
 
 
 def torques_of_trapezoids(duration):

@@ -248,7 +248,7 @@ def _instants(
     transmission = dynamics.transmission(q_tree)
     tau = minimum_norm_within(transmission, force, limits.torque)
     missing = np.abs(np.einsum("mdk,mk->md", transmission, tau) - force).max(axis=1) / np.abs(force).max()
-    return dynamics.instants(q_tree, v, a, tau), missing
+    return dynamics.with_torques(at, tau), missing
 
 
 def _torque_table(

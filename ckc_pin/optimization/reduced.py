@@ -8,7 +8,7 @@ follow from the implicit function theorem.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -105,6 +105,7 @@ class ReducedDynamics:
         self.q_in_tree = tree.q_index[self.q_at]
         self.z_in_tree = np.setdiff1d(np.arange(tree.nq), self.q_in_tree)
         self._functions = MotionFunctions(mechanism)
+        self._last = np.zeros((0, 0)), np.zeros(0), np.zeros(0)  # configurations, Jacobians and inverses
         self.state_symbols = tuple(
             casadi.SX.sym(name, size)
             for name, size in (("q", tree.nq), ("v", self.n), ("v_dot", self.n), ("tau", self.motors))
@@ -206,8 +207,7 @@ class ReducedDynamics:
 
     def rho(self, q_tree: Array) -> Array:
         """Return rho of eq. 5 at closed configurations, (m, n, d)."""
-        J = self.jacobians(q_tree)
-        return self._rho(J, _inverse(J[:, :, self.z_at]))
+        return self._rho(*self._jacobians_and_inverses(q_tree))
 
     def transmission(self, q_tree: Array) -> Array:
         """Return rho^T G^T at closed configurations, (m, d, motors): forces of eq. 6 by motor torques."""
@@ -222,6 +222,14 @@ class ReducedDynamics:
     def jacobians(self, q_tree: Array) -> Array:
         """Return the independent rows of J at configurations (m, nq), (m, rows, n)."""
         return self._functions.rates(q_tree, np.zeros((len(q_tree), self.n)))[0]
+
+    def _jacobians_and_inverses(self, q_tree: Array) -> tuple[Array, Array]:
+        """Return J (m, rows, n) and phi_z^-1 (m, nz, rows), which are kept until other configurations are given."""
+        last = self._last
+        if not np.array_equal(last[0], q_tree):
+            J = self.jacobians(q_tree)
+            last = self._last = np.array(q_tree), J, _inverse(J[:, :, self.z_at])
+        return last[1:]
 
     def smallest_singular_values(self, q_tree: Array, z_at: IntArray | None = None) -> Array:
         """Return smallest singular values of phi_z at configurations (m, nq); 1 without loops.
@@ -250,17 +258,26 @@ class ReducedDynamics:
     def instants(self, q_tree: Array, v: Array, a: Array, tau: Array) -> MotionInstants:
         """Return a motion at closed configurations with rates and accelerations (m, d) and torques (m, motors)."""
         v_tree, a_tree = np.zeros((2, len(q_tree), self.n))
-        J, _ = self._functions.rates(q_tree, v_tree)
-        inverse = _inverse(J[:, :, self.z_at])
+        J, inverse = self._jacobians_and_inverses(q_tree)
         v_tree[:, self.q_at], a_tree[:, self.q_at] = v, a
         v_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], v))
         _, J_dot_v = self._functions.rates(q_tree, v_tree)
         a_tree[:, self.z_at] = -_times(inverse, _times(J[:, :, self.q_at], a) + J_dot_v[:, :, 0])
         (passive,) = self._functions.forces(q_tree, v_tree, a_tree)
-        force = passive[:, :, 0] + self._friction(v_tree)[0] - tau @ self.mechanism.motors.transmission
-        multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
-        missing = force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
+        forces = passive[:, :, 0] + self._friction(v_tree)[0] - tau @ self.mechanism.motors.transmission
+        multipliers, missing = self._reduce(q_tree, forces)
         return MotionInstants(q_tree, v_tree, a_tree, multipliers, tau, missing)
+
+    def with_torques(self, at: MotionInstants, tau: Array) -> MotionInstants:
+        """Return a motion with other motor torques (m, motors)."""
+        multipliers, force = self._reduce(at.q_tree, (at.tau - tau) @ self.mechanism.motors.transmission)
+        return replace(at, multipliers=at.multipliers + multipliers, tau=tau, force=at.force + force)
+
+    def _reduce(self, q_tree: Array, force: Array) -> tuple[Array, Array]:
+        """Return the multipliers (m, rows) that balance a force (m, n) along z, and what remains of it along q."""
+        J, inverse = self._jacobians_and_inverses(q_tree)
+        multipliers = _times(inverse.transpose(0, 2, 1), force[:, self.z_at])
+        return multipliers, force[:, self.q_at] - _times(J[:, :, self.q_at].transpose(0, 2, 1), multipliers)
 
     def _friction(self, v_tree: Array) -> Array:
         """Return the forces that dry friction takes, and two derivatives by the rates, (3, m, n)."""

@@ -5,14 +5,23 @@ import pandas
 import pytest
 
 from ckc_pin import InputError, load
+from ckc_pin.analysis.map import loci as curves
 from ckc_pin.analysis.map import singularity_map
 from ckc_pin.analysis.map.loci import LocusSystem
 from ckc_pin.kinematics.extended import extend_closure
 from tests.analytic.five_bar import AS_PRINTED, FIVE_BAR
-from tests.conftest import assert_close
+from tests.conftest import CURVE_STEP, assert_close
 
 MODELS = {"five_bar": FIVE_BAR, "five_bar_as_printed": AS_PRINTED}
 CELLS = 40
+
+
+@pytest.fixture(scope="module", autouse=True)
+def many_points():
+    """Compute as many points of curves as for users, other than in the tests of other files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curves, "CURVE_STEP", CURVE_STEP)
+        yield
 
 
 @pytest.fixture(scope="module", params=MODELS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ckc_pin
-from ckc_pin.analysis.map import loci, workspace_sections
+from ckc_pin.analysis.map import workspace_sections
 from ckc_pin.analysis.map.sections import SectionStack
 from ckc_pin.view.map_figures import draw_sections
 
@@ -35,7 +35,6 @@ BOXES = []  # stacks with their boxes, whose search takes longer than the sectio
 def stack():
     done, find_box = [], SectionStack.find_box
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loci, "CURVE_STEP", 0.15)  # fewer points, which are as accurate
         patch.setattr(SectionStack, "find_box", lambda self: BOXES.append((self, find_box(self))) or BOXES[-1][1])
         sections = workspace_sections("delta", count=2, cells=16, progress=done.append)
     assert (done[0], done[-1]) == (0.0, 1.0)

@@ -10,9 +10,9 @@ import numpy as np
 
 from ckc_pin.explorer import messages
 from tests.browser.explorer import ROOT, five_bar, open_explorer, program
-from tests.browser.pages import browser, look_at
+from tests.browser.pages import browser, look_at, tabs
 
-__all__ = ["browser", "five_bar", "look_at", "program"]
+__all__ = ["browser", "five_bar", "look_at", "program", "tabs"]
 
 
 class QuietHandler(SimpleHTTPRequestHandler):

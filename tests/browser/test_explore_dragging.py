@@ -10,9 +10,9 @@ import pytest
 from ckc_pin.explorer import messages
 from ckc_pin.view import commands
 from tests.browser.explorer import ROOT, StandIn, five_bar, open_explorer, program
-from tests.browser.pages import Visit, browser, look_at
+from tests.browser.pages import Visit, browser, look_at, tabs
 
-__all__ = ["browser", "five_bar", "look_at", "program"]
+__all__ = ["browser", "five_bar", "look_at", "program", "tabs"]
 
 VIEW = """() => {
   viewer.scene.updateMatrixWorld(true);

@@ -12,9 +12,9 @@ import pytest
 
 from ckc_pin.explorer import messages
 from tests.browser.explorer import PARAMETERS, QUANTITIES, ROOT, five_bar, open_explorer, program
-from tests.browser.pages import Visit, browser, look_at
+from tests.browser.pages import Visit, browser, look_at, tabs
 
-__all__ = ["browser", "five_bar", "look_at", "program"]
+__all__ = ["browser", "five_bar", "look_at", "program", "tabs"]
 
 HOSTILE = '"><img src=x onerror="window.pwned=1"><script>window.pwned=1</script>'
 

@@ -11,10 +11,10 @@ import pytest
 import ckc_pin
 from ckc_pin.view.live import live_view
 from ckc_pin.view.player import play_runs, save_html
-from tests.browser.pages import browser, look_at
+from tests.browser.pages import browser, look_at, tabs
 from tests.contract.sketches import FOUR_BAR, FOUR_BAR_LOOP, START_OF_FOUR_BAR, tetrahedron, write_scene
 
-__all__ = ["browser", "look_at"]
+__all__ = ["browser", "look_at", "tabs"]
 
 L_PROXIMAL, BASE = 0.2794, 0.3048  # of five_bar
 ELBOWS = {"theta_1": ("theta_2", 0.0), "theta_3": ("theta_4", BASE)}  # proximal joint: elbow, foot

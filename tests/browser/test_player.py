@@ -13,9 +13,9 @@ import pytest
 import ckc_pin
 from ckc_pin.view.page import STATIC
 from ckc_pin.view.player import save_html
-from tests.browser.pages import browser, look_at
+from tests.browser.pages import browser, look_at, tabs
 
-__all__ = ["browser", "look_at"]
+__all__ = ["browser", "look_at", "tabs"]
 
 END = 9.5  # s, of five_bar/tracking
 FIRST, SECOND = "/world/1: reduced", "/world/2: SPF, ε = 10⁻⁴"
@@ -26,15 +26,21 @@ def runs(run) -> list[ckc_pin.Run]:
     return [run("five_bar/tracking", formulation=name) for name in ("reduced", "spf")]
 
 
-@pytest.fixture
-def visit(look_at, runs, tmp_path):
-    """A file of two runs, the second one stopped early, with forces; it stands at its start."""
+@pytest.fixture(scope="module")
+def saved(runs, tmp_path_factory):
+    """A file of two runs, the second one stopped early, with forces."""
     rows = slice(0, int(np.searchsorted(runs[1].t, 4.0)) + 1)
     names = ("t", "q_tree", "v_tree", "u", "tau", "phi", "w", "energy", "lyapunov")
     short = replace(
         runs[1], status="stopped", message="phi_z is <singular>", **{n: getattr(runs[1], n)[rows] for n in names}
     )
-    opened = look_at(save_html([runs[0], short], tmp_path / "two.html", forces=True).as_uri(), offline=True)
+    return save_html([runs[0], short], tmp_path_factory.mktemp("saved") / "two.html", forces=True)
+
+
+@pytest.fixture
+def visit(look_at, saved):
+    """The page of two runs, which stands at its start."""
+    opened = look_at(saved.as_uri(), offline=True)
     opened.page.evaluate("player.pause(); player.seek(0)")
     return opened
 
@@ -185,7 +191,7 @@ def test_bar_does_not_cover_the_mechanism(visit):
 
 
 def test_video_is_recorded_as_webm(visit, tmp_path):
-    visit.page.evaluate("viewer.animator.mixer.timeScale = 4")
+    visit.page.evaluate("viewer.animator.mixer.timeScale = 16")
     with visit.page.expect_download(timeout=60_000) as waiting:
         visit.page.keyboard.press("r")
     assert waiting.value.suggested_filename == "five_bar_tracking.webm"

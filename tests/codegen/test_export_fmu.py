@@ -46,6 +46,11 @@ def scene_of(name: str) -> Scene:
     return load_scene(shipped, {**overrides, **solver})
 
 
+@cache
+def run_of(name: str) -> Run:
+    return simulate(scene_of(name))
+
+
 @pytest.fixture(scope="module")
 def fmu_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
     """Return the file of a scene's FMU, which is written once."""
@@ -96,7 +101,7 @@ def test_fmu_is_valid(name: str, fmi: str, fmu_of: Callable[[str, str], Path]) -
 @pytest.mark.parametrize("fmi", FMI)
 @pytest.mark.parametrize("name", SCENES)
 def test_fmu_moves_as_the_run_does(name: str, fmi: str, kind: str, fmu_of: Callable[[str, str], Path]) -> None:
-    mechanism, ours = load_scene_mechanism(scene_of(name)), simulate(scene_of(name))
+    mechanism, ours = load_scene_mechanism(scene_of(name)), run_of(name)
     outputs = [name for names in kinds_of_outputs(mechanism).values() for name in names]
     theirs = simulate_fmu(fmu_of(name, fmi), kind, [*outputs, "phi.max"])
     limit = EXACT if kind == "CoSimulation" else MAX_MODEL_EXCHANGE_ERROR
@@ -120,8 +125,7 @@ def test_larger_fmus_move_as_the_runs_do(name: str, t_end: float, tmp_path: Path
 @pytest.mark.parametrize("name", SCENES)
 def test_derivatives_of_model_exchange_are_those_of_the_run(name: str, fmu_of: Callable[[str, str], Path]) -> None:
     """SciPy integrates the FMU's derivatives more accurately than CVode does."""
-    fmu, scene = Instance(fmu_of(name, "2.0"), "ModelExchange"), scene_of(name)
-    ours = simulate(scene)
+    fmu, ours = Instance(fmu_of(name, "2.0"), "ModelExchange"), run_of(name)
     solution = solve_ivp(fmu.rates, (0.0, T_END), fmu.get_states(), "DOP853", t_eval=ours.t, rtol=1e-12, atol=1e-13)
     for state, actual in zip(fmu.states, solution.y, strict=True):
         expected = ours[state]

@@ -9,10 +9,8 @@ raise their total. `python -m tests.contract.language ROOM` prints the hits in a
 from __future__ import annotations
 
 import ast
-import io
 import re
 import sys
-import tokenize
 import tomllib
 from bisect import bisect
 from collections.abc import Iterator
@@ -20,7 +18,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["BOUNDS", "NAMES", "PHRASES", "Hit", "bounds", "check_name", "check_prose", "count", "hits", "main", "rooms"]
+__all__ = [
+    "BOUNDS", "NAMES", "PHRASES", "Hit", "Module", "bounds", "check_name", "check_prose", "count", "hits", "main",
+    "read_module", "rooms",
+]  # fmt: skip
 
 ROOT = Path(__file__).resolve().parents[2]
 BOUNDS = Path(__file__).with_name("language_bounds.toml")
@@ -187,6 +188,19 @@ def check_prose(text: str) -> list[tuple[int, str, str]]:
 # --- Python ----------------------------------------------------------------------------------------
 
 
+_STRING_OR_COMMENT = re.compile(
+    r"'''(?:\\.|.)*?'''|\"\"\"(?:\\.|.)*?\"\"\"|'(?:\\.|[^'\\\n])*'|\"(?:\\.|[^\"\\\n])*\"|#[^\n]*", re.DOTALL
+)
+
+
+def _comments(text: str) -> Iterator[tuple[int, str]]:
+    """Comments of a module, with their lines."""
+    ends = [match.start() for match in re.finditer("\n", text)]
+    for match in _STRING_OR_COMMENT.finditer(text):
+        if match[0].startswith("#"):
+            yield bisect(ends, match.start()) + 1, match[0]
+
+
 def _bindings(tree: ast.Module, nodes: list[ast.AST]) -> Iterator[tuple[int, str, bool, bool]]:
     """Names that a module binds: (line, name, is a function or class, is a constant of the module)."""
     top = {id(node) for statement in tree.body if isinstance(statement, ast.Assign | ast.AnnAssign)
@@ -212,20 +226,51 @@ def _python_prose(text: str, nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inside_f:
             yield node.lineno, node.value
     block, start, last = [], 0, -1
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
-        if token.type == tokenize.COMMENT:
-            if token.start[0] != last + 1:
-                yield start, "\n".join(block)
-                block, start = [], token.start[0]
-            block.append(token.string)
-            last = token.start[0]
+    for line, comment in _comments(text):
+        if line != last + 1:
+            yield start, "\n".join(block)
+            block, start = [], line
+        block.append(comment)
+        last = line
     yield start, "\n".join(block)
 
 
-def _python(file: str) -> Iterator[tuple[str, Hit]]:
+def _identifiers(nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
+    """Every identifier that a module makes or uses, with its line."""
+    for node in nodes:
+        fields = vars(node)
+        for field in ("id", "attr", "arg", "name", "asname"):
+            if isinstance(fields.get(field), str):
+                yield fields.get("lineno", 0), fields[field]
+
+
+@dataclass(frozen=True)
+class Module:
+    """What the tests need of a module, so that it is parsed once.
+
+    `classes` are the public ones at its top, `identifiers` have their lines, and `hits` their kinds.
+    """
+
+    classes: tuple[str, ...]
+    identifiers: frozenset[tuple[int, str]]
+    hits: tuple[tuple[str, Hit], ...]
+
+
+@cache
+def read_module(file: str) -> Module:
+    """Read a Python file, given as a path from the project's top."""
     text = (ROOT / file).read_text(encoding="utf-8")
     tree = ast.parse(text)
     nodes = list(ast.walk(tree))
+    classes = tuple(x.name for x in tree.body if isinstance(x, ast.ClassDef) and not x.name.startswith("_"))
+    return Module(classes, frozenset(_identifiers(nodes)), tuple(_python_hits(file, text, tree, nodes)))
+
+
+def _python(file: str) -> Iterator[tuple[str, Hit]]:
+    yield from read_module(file).hits
+
+
+def _python_hits(file: str, text: str, tree: ast.Module, nodes: list[ast.AST]) -> Iterator[tuple[str, Hit]]:
     names = list(_bindings(tree, nodes))
     sides = any(name.strip("_").startswith("right") for _, name, _, _ in names)
     for line, name, function, constant in names:

@@ -6,10 +6,8 @@ The vocabulary of names and phrases, the rooms that still use them and the comma
 
 from __future__ import annotations
 
-import ast
 import re
 from collections import defaultdict
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -53,14 +51,6 @@ def files() -> tuple[str, ...]:
     return tuple(sorted(path.as_posix() for path in paths))
 
 
-@cache
-def identifiers(file: str) -> tuple[list[str], set[tuple[int, str]]]:
-    """Return the public classes at the top of a module, and the lines and names of `names`."""
-    parsed = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    classes = [n.name for n in parsed.body if isinstance(n, ast.ClassDef) and not n.name.startswith("_")]
-    return classes, set(names(parsed))
-
-
 # --- classes ---------------------------------------------------------------------------------------
 
 
@@ -68,7 +58,7 @@ def test_no_two_public_classes_have_one_name() -> None:
     where = defaultdict(list)
     for file in files():
         if file.startswith(("ckc_pin/", "scripts/experiments/")) and "/tests/" not in file:
-            for name in identifiers(file)[0]:
+            for name in language.read_module(file).classes:
                 where[name].append(file)
     assert len(where) > 100
     in_package = {name: sum(file.startswith("ckc_pin/") for file in places) for name, places in where.items()}
@@ -77,15 +67,6 @@ def test_no_two_public_classes_have_one_name() -> None:
 
 
 # --- words -----------------------------------------------------------------------------------------
-
-
-def names(parsed: ast.Module) -> Iterator[tuple[int, str]]:
-    """Every identifier that a module makes or uses, with its line."""
-    for node in ast.walk(parsed):
-        fields = vars(node)
-        for field in ("id", "attr", "arg", "name", "asname"):
-            if isinstance(fields.get(field), str):
-                yield fields.get("lineno", 0), fields[field]
 
 
 def words(name: str) -> list[str]:
@@ -114,7 +95,8 @@ def test_no_name_has_a_word_that_another_stands_for(top: str) -> None:
     assert under_top
     faults = [f"{file}: {fault}" for file in under_top for fault in forbidden(Path(file).stem)]
     for file in under_top:
-        faults += [f"{file}:{line}: {fault}" for line, name in identifiers(file)[1] for fault in forbidden(name)]
+        module = language.read_module(file)
+        faults += [f"{file}:{line}: {fault}" for line, name in module.identifiers for fault in forbidden(name)]
     assert sorted(set(faults)) == []
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from ckc_pin.analysis.map import loci
 from ckc_pin.formats.fmu import writer
 from tests.conftest import QUICK
 
@@ -15,4 +14,3 @@ from tests.conftest import QUICK
 def cache(writable_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(writable_cache))
     monkeypatch.setattr(writer, "FLAGS", QUICK)
-    monkeypatch.setattr(loci, "CURVE_STEP", 0.15)  # fewer points of curves, which are as accurate

@@ -5,19 +5,28 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote, urlsplit
 
 import pytest
 from docutils import nodes
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 
 from scripts.site.gallery import ROOT, examples
 from scripts.site.links import broken
 from scripts.site.search_texts import read_page_text
-from tests.browser.pages import PATIENCE, browser
+from tests.browser.pages import PATIENCE, Tabs, browser, tabs
 
-__all__ = ["browser"]  # a fixture
+__all__ = ["browser", "tabs"]  # fixtures
+
+
+@pytest.fixture
+def page(tabs: Tabs) -> Iterator[Page]:
+    """A tab without network."""
+    visit = tabs.visit((1280, 900), offline=True)
+    yield visit.page
+    tabs.leave(visit)
 
 
 @pytest.fixture(scope="module")
@@ -76,20 +85,17 @@ def test_gallery_has_every_example(site: Path) -> None:
     ] == []
 
 
-def test_gallery_shows_thumbnails_sharply(site: Path, browser: Browser) -> None:
-    page = browser.new_page(viewport={"width": 1280, "height": 900})
+def test_gallery_shows_thumbnails_sharply(site: Path, page: Page) -> None:
     page.goto((site / "gallery.html").as_uri())
     sizes = page.evaluate(
         """() => Array.from(document.querySelectorAll(".sd-card-img-top")).map(i => [i.naturalWidth, i.clientWidth])"""
     )
     assert len(sizes) == len(examples())
     assert all(2 * shown <= natural for natural, shown in sizes)
-    page.close()
 
 
-def test_search_finds_key_by_its_unit(site: Path, browser: Browser) -> None:
+def test_search_finds_key_by_its_unit(site: Path, page: Page) -> None:
     """Searched from disk, in a browser without network; the result links to the key."""
-    page = browser.new_context(offline=True).new_page()
     page.goto(f"{(site / 'search.html').as_uri()}?q=rad%2Fs")
     result = page.locator("#search-results li a", has_text="frequency [rad/s]").first
     result.wait_for(timeout=PATIENCE * 1e3)
@@ -98,7 +104,6 @@ def test_search_finds_key_by_its_unit(site: Path, browser: Browser) -> None:
     key = page.evaluate("document.getElementById(decodeURIComponent(location.hash.slice(1))).textContent")
     assert "frequency" in key
     assert "rad/s" in key
-    page.context.close()
 
 
 def search(site: Path, page: Page, query: str) -> list[dict[str, str]]:
@@ -114,8 +119,7 @@ def search(site: Path, page: Page, query: str) -> list[dict[str, str]]:
     return results
 
 
-def test_search_from_disk_shows_excerpts_with_the_query(site: Path, browser: Browser) -> None:
-    page = browser.new_context(offline=True).new_page()
+def test_search_from_disk_shows_excerpts_with_the_query(site: Path, page: Page) -> None:
     requests: list[str] = []
     page.on("request", lambda request: requests.append(request.url))
     for query in ("rad/s", "friction", "--video"):
@@ -124,12 +128,10 @@ def test_search_from_disk_shows_excerpts_with_the_query(site: Path, browser: Bro
         assert [r for r in results if query not in f"{r['title']} {r['excerpt']}".lower()] == []
         assert [r for r in results if not 10 < len(r["excerpt"]) <= 250] == []
     assert [url for url in requests if not url.startswith("file:")] == []
-    page.context.close()
 
 
-def test_search_for_a_unit_ranks_keys_of_that_unit_first(site: Path, browser: Browser) -> None:
+def test_search_for_a_unit_ranks_keys_of_that_unit_first(site: Path, page: Page) -> None:
     """Pages that have "rad" and an "s" somewhere are not results, nor are keys in rad/s² alone."""
-    page = browser.new_context(offline=True).new_page()
     results = search(site, page, "rad/s")
     is_key = ["rad/s" in result["title"] for result in results]
     assert sum(is_key) > 5
@@ -139,12 +141,11 @@ def test_search_for_a_unit_ranks_keys_of_that_unit_first(site: Path, browser: Br
         file = urlsplit(result["address"]).path
         assert re.search(r"rad/s(?![²\w])", re.sub(r"<[^>]+>", "", Path(file).read_text(encoding="utf-8")))
     assert search(site, page, "friction")[0]["title"].startswith("joint.friction")
-    page.context.close()
 
 
 @pytest.mark.parametrize("width", [390, 1100, 1280, 1600])
-def test_no_line_of_code_is_cut_off(site: Path, browser: Browser, width: int) -> None:
-    page = browser.new_context(offline=True, viewport={"width": width, "height": 900}).new_page()
+def test_no_line_of_code_is_cut_off(site: Path, page: Page, width: int) -> None:
+    page.set_viewport_size({"width": width, "height": 900})
     for path in ("start.html", "gallery.html", "guide/events.html", "guide/control.html", "reference/errors.html"):
         page.goto((site / path).as_uri())
         cut = page.evaluate(
@@ -153,7 +154,6 @@ def test_no_line_of_code_is_cut_off(site: Path, browser: Browser, width: int) ->
         )
         assert cut == []
         assert page.evaluate("document.documentElement.scrollWidth") == width
-    page.context.close()
 
 
 def test_anchors_of_page_texts_are_where_their_text_begins() -> None:

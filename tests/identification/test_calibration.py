@@ -125,14 +125,14 @@ def test_noise_of_angles_and_lengths_is_estimated_separately(five_bar: Mechanism
 
 def test_huber_loss_withstands_five_percent_of_outliers(five_bar: Mechanism, crb: Array) -> None:
     truth = dict(zip(NAMES, TRUTH, strict=True))
-    rms, count = {}, {"squares": 12, "huber": 60}
+    rms, count = {}, {"squares": 12, "huber": 40}
     for loss in ("squares", "huber"):
         results = [calibrate(five_bar, measure(k, 0.05), NAMES, loss=loss, noise=NOISE) for k in range(count[loss])]
         off = np.array([errors(x, truth) for x in results])
         rms[loss] = np.sqrt(np.mean(off**2, axis=0)) / crb
     stds = np.array([[x.parameters[name].std for name in NAMES] for x in results], dtype=float)  # with Huber's loss
-    assert np.mean(np.abs(off) < 2 * stds) > 0.9  # 0.9545; 60 trials have a standard error of 0.02
-    assert np.all(np.sqrt(np.mean((off / stds) ** 2, axis=0)) < 1.35)  # 1; standard error 0.1
+    assert np.mean(np.abs(off) < 2 * stds) > 0.9  # 0.9545; 40 trials have a standard error of 0.02
+    assert np.all(np.sqrt(np.mean((off / stds) ** 2, axis=0)) < 1.35)  # 1; standard error 0.11
     assert np.all(rms["huber"] < 1.5), rms["huber"]
     assert np.all(rms["squares"] > 5.0), rms["squares"]
 

@@ -105,7 +105,7 @@ def test_truth_is_within_two_standard_deviations(driven):
     start = load("five_bar", {name: 1.5 * value for name, value in TRUE.items()})
     names, truth = [*TRUE, "link.link_2.mass"], {**TRUE, "link.link_2.mass": 0.2611}
     inside = total = 0
-    for seed in range(15):
+    for seed in range(10):
         data = measure(run_five_bar(driven=driven), noise=3e-4, seed=seed, driven=driven)
         result = identify(start, data, names, method="motion")
         for name, value in truth.items():

@@ -72,7 +72,7 @@ def errors(result, mechanism, parameters=PARAMETERS):
 def test_exact_data_give_the_truth(name, count):
     parameters = PARAMETERS if name == "five_bar" else ("link.*.inertial",)
     start = load(name, {"link.link_1.mass": 0.2, "link.link_3.mass": 0.3}) if name == "five_bar" else load(name)
-    data = record(name, t_end=1.5, dt=0.001)
+    data = record(name, t_end=1.5, dt=0.002)
     result = identify(start, data, parameters, physical=False)
     assert len(result.base) == count
     off, _ = errors(result, motion(name, 4.0, 0.004)[0] if name == "five_bar" else start, parameters)
@@ -81,7 +81,7 @@ def test_exact_data_give_the_truth(name, count):
 
 def test_truth_is_within_two_standard_deviations():
     inside = total = 0
-    for seed in range(12):
+    for seed in range(8):
         result = identify("five_bar", record("five_bar", 1e-4, 0.01, seed), PARAMETERS, physical=False)
         off, std = errors(result, motion("five_bar", 4.0, 0.004)[0])
         inside, total = inside + int(np.sum(np.abs(off) <= 2 * std)), total + len(off)
@@ -101,7 +101,7 @@ def test_torques_of_another_motion_are_predicted_to_their_noise():
 
 def test_torques_of_other_phases_are_predicted_to_their_noise():
     """Noise of the platform's forces is 0.1 % of them, so errors of its accelerations count."""
-    assert run_trials("stewart", "torques", 2).validation_rms <= 1.05
+    assert run_trials("stewart", "torques", 1).validation_rms <= 1.05
 
 
 def test_expected_residuals_contain_the_errors_of_accelerations():

@@ -30,8 +30,8 @@ PICK = {"point": {"plate": [[0.0, 0.0, -0.29], [0.0, 0.0, -0.27], [0.1, 0.0, -0.
 
 
 @cache
-def five_bar() -> Plan:
-    return optimize("five_bar", path=FIVE_BAR, limits={"torque": 2.0})
+def five_bar(intervals: int | None = None) -> Plan:
+    return optimize("five_bar", path=FIVE_BAR, limits={"torque": 2.0}, intervals=intervals)
 
 
 def test_double_integrator_is_bang_bang() -> None:
@@ -102,9 +102,7 @@ def test_some_limit_is_active_at_all_times() -> None:
 
 @pytest.mark.parametrize(("intervals", "tolerance"), [(50, 1e-3), (200, 5e-5)])
 def test_duration_converges_with_the_grid(intervals: int, tolerance: float) -> None:
-    coarse = optimize("five_bar", path=FIVE_BAR, limits={"torque": 2.0}, intervals=intervals)
-    fine = optimize("five_bar", path=FIVE_BAR, limits={"torque": 2.0}, intervals=400)
-    assert coarse.t_end == pytest.approx(fine.t_end, rel=tolerance)
+    assert five_bar(intervals).t_end == pytest.approx(five_bar(400).t_end, rel=tolerance)
 
 
 def test_plate_of_the_delta_follows_lines_with_rounded_corners() -> None:

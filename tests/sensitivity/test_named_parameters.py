@@ -13,6 +13,7 @@ import ckc_pin
 from ckc_pin import InputError, MechanismError, simulate
 from ckc_pin.mechanism.parameters import values_of, with_components
 from ckc_pin.sensitivity.sensitivities import Sensitivities, sensitivities
+from tests.conftest import remember
 from tests.sensitivity.four_bar import TIGHT, write_four_bar
 from tests.sensitivity.spatial import write_arms, write_tethered_body
 
@@ -20,6 +21,7 @@ TOLERANCE = 1e-8  # relative to the largest
 MOTION = ("q_tree", "v_tree")
 
 
+@remember
 def differences(scene: str, name: str, h: float, overrides: dict[str, Any], parts: tuple[str, ...] = MOTION) -> Any:
     """Finite differences of runs with overrides; tests/contract compares overrides with edited files."""
     loaded = ckc_pin.load_scene(scene, overrides)
@@ -178,7 +180,7 @@ def test_parameters_of_a_motor_on_several_joints(formulation: str, tmp_path: Pat
     for terms in ("pinocchio", "generated"):
         result = sensitivities(scene, names, {**TIGHT, "solver.terms": terms})
         assert result.run.stats["terms"] == terms
-        agree(result, scene, TIGHT, h=2e-3, tolerance=2e-8)  # Differences by Pinocchio's terms need no compiler.
+        agree(result, scene, TIGHT, h=2e-3, tolerance=2e-8)  # The same differences, by Pinocchio's terms
 
 
 def test_equal_torque_limits_of_motor_and_controller_are_rejected(tmp_path: Path) -> None:
