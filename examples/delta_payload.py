@@ -11,7 +11,7 @@ import numpy as np
 import ckc_pin
 from ckc_pin.view.style import figure_style
 
-LOADS = [0.0, 0.05, 0.1, 0.2, 0.35, 0.5]  # kg
+LOADS = [0.0, 0.1, 0.25, 0.5]  # kg
 ENCODER, TORQUE = 1e-4, 0.02  # standard deviations, rad and N m
 WAVES = {
     f"arm_{k}": {"offset": 0.3, "harmonics": [[0.3, 3.0 + k, 0.7 * k], [0.1, 9.0 - k, k], [0.05, 14.0, 2.0 * k]]}

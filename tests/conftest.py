@@ -201,7 +201,7 @@ def few_points_of_curves() -> Iterator[None]:
 
 def forget_process_folder(patch: pytest.MonkeyPatch) -> None:
     """Let the process find no terms that earlier tests have compiled without a cache."""
-    patch.setattr(library, "_process_folder", cache(library._process_folder.__wrapped__))
+    patch.setattr(library, "process_folder", cache(library.process_folder.__wrapped__))
 
 
 def _shared_folder(tmp_path_factory: pytest.TempPathFactory, name: str) -> Path:

@@ -36,6 +36,7 @@ __all__ = [
     "explain_too_large",
     "find_compiled_terms",
     "is_private",
+    "process_folder",
     "structure_key",
 ]
 
@@ -130,8 +131,8 @@ def compile_terms(
     if limited and (reason := explain_too_large(mechanism)):
         raise InputError(f"{mechanism.name}: {reason}")
     subject = _Subject.of(mechanism, which, directional_derivatives, of_members)
-    is_used = _process_folder.cache_info().currsize > 0  # by terms that the cache could not take
-    for folder in (cache_folder(), *([_process_folder()] if is_used else [])):
+    is_used = process_folder.cache_info().currsize > 0  # by terms that the cache could not take
+    for folder in (cache_folder(), *([process_folder()] if is_used else [])):
         if (library := _look_up(subject, folder)) is not None:
             return library
     compiler = find_compiler(subject.directional_derivatives)
@@ -315,7 +316,7 @@ def _store(name: str, content: bytes) -> Path:
             return _write_file(folder / name, content)
     except (OSError, InputError):
         pass
-    return _write_file(_process_folder() / name, content)
+    return _write_file(process_folder() / name, content)
 
 
 def _write_file(path: Path, content: bytes) -> Path:
@@ -325,7 +326,8 @@ def _write_file(path: Path, content: bytes) -> Path:
 
 
 @cache
-def _process_folder() -> Path:
+def process_folder() -> Path:
+    """Return a folder for what the user's cache cannot take, which is removed when the process ends."""
     import atexit
     import shutil
     import tempfile

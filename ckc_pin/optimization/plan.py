@@ -299,16 +299,13 @@ def _relative_names(files: list[Path]) -> list[str]:
     return [path.relative_to(folder).as_posix() for path in files]
 
 
-def measure(
-    mechanism: Mechanism, dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants
-) -> tuple[Array, Array]:
-    """Return the quantities of `limits.names`, (m, names), and relative smallest singular values of phi_z, (m,)."""
+def measure(mechanism: Mechanism, dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants) -> Array:
+    """Return the quantities of `limits.names`, (m, names)."""
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
     shafts, distances = at.v_tree @ mechanism.motors.transmission.T, dynamics.distances(at.q_tree, limits.spheres)
     power = shafts * at.tau
-    quantities = np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, power, power.sum(axis=1, keepdims=True),
-                            distances])  # fmt: skip
-    return quantities, dynamics.margins(at.q_tree, mechanism.partition.z)
+    return np.hstack([numbers, at.v_tree, at.a_tree, shafts, at.tau, power, power.sum(axis=1, keepdims=True),
+                      distances])  # fmt: skip
 
 
 def find_active(limits: MotionLimits, t: Array, quantities: Array, margin: Array) -> list[ActiveLimit]:

@@ -69,7 +69,7 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
         if replay.error <= REPLAY_ERROR:
             break
     require_replayed(mechanism, replay, t_end)
-    quantities, margin = measure(mechanism, dynamics, limits, at)
+    quantities, margin = measure(mechanism, dynamics, limits, at), dynamics.margins(at.q_tree)
     return Plan(
         mechanism=mechanism, status="solved", t_end=t_end,
         message="the fastest motion along the path" if _is_fastest(spec, limits) else "a local optimum along the path",
@@ -225,7 +225,7 @@ def _exceeds_inside(
     at = np.arange(len(corners) - 1) if which is None else np.flatnonzero(which)
     t = corners[at, None] + np.diff(corners)[at, None] * inside
     instants, missing = _instants(dynamics, motion, t.ravel(), limits)
-    excess = limits.excess(measure(dynamics.mechanism, dynamics, limits, instants)[0]).max(axis=1)
+    excess = limits.excess(measure(dynamics.mechanism, dynamics, limits, instants)).max(axis=1)
     exceeded = np.zeros(len(corners) - 1, dtype=bool)
     exceeded[at] = ((excess > 0) | (missing > FORCE_TOLERANCE)).reshape(t.shape).any(axis=1)
     return exceeded

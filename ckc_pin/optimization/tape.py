@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from ckc_pin.base.atomic_files import write_atomic
-from ckc_pin.codegen.library import cache_folder, is_private
+from ckc_pin.codegen.library import cache_folder, is_private, process_folder
 from ckc_pin.errors import InputError
 
 __all__ = ["Tape", "find_or_derive"]
@@ -92,19 +92,21 @@ class Tape(msgspec.Struct, frozen=True):
 
 
 def find_or_derive(key: str, derive: Callable[[], Tape]) -> Tape:
-    """Return the tape of a key from the user's cache, or derive and store it. The cache may not be writable."""
-    with suppress(OSError, InputError):
-        folder = cache_folder()
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if is_private(folder):
-            path = folder / f"{key}.tape"
-            tape = _read(path)
-            if tape is None:
-                tape = derive()
-                with suppress(InputError):
-                    _write(path, tape)
-            return tape
-    return derive()
+    """Return the tape of a key, or derive and store it: in the user's cache, or for this process if that fails."""
+    tape: Tape | None = None
+    for locate in (cache_folder, process_folder):
+        with suppress(OSError, InputError):
+            folder = locate()
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if is_private(folder):
+                path = folder / f"{key}.tape"
+                stored = _read(path)
+                if stored is not None:
+                    return stored
+                tape = tape or derive()
+                _write(path, tape)
+                return tape
+    return tape or derive()
 
 
 def _read(path: Path) -> Tape | None:

@@ -133,8 +133,8 @@ def _nominal(name: str) -> float:
 def main(out: Path, quick: bool = False) -> None:
     """Draw the figures and print both studies."""
     out.mkdir(parents=True, exist_ok=True)
-    lengths = tolerances(out, *((16, 4) if quick else (512, 64)))
+    lengths = tolerances(out, *((8, 2) if quick else (512, 64)))
     print(f"Lengths wrong by {DEVIATION * 1e3:g} mm (standard deviation)\n\n{lengths}\n")
-    print(f"Set-point control from everywhere\n\n{basin(out, *((9, 15) if quick else (41, DIVISIONS)))}")
+    print(f"Set-point control from everywhere\n\n{basin(out, *((5, 9) if quick else (41, DIVISIONS)))}")
     for figure in out.glob("*.png"):
         shrink(figure)

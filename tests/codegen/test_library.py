@@ -111,7 +111,7 @@ def test_libraries_are_not_loaded_from_a_noexec_file_system(folder: Path, monkey
         mounted_noexec((folder,), patch)
         assert library.find_compiled_terms(load(NAME)) is None
         assert Path(library.compile_terms(load(NAME)).path).parent != folder
-    mounted_noexec((folder, Path(tempfile.gettempdir()), library._process_folder()), monkeypatch)
+    mounted_noexec((folder, Path(tempfile.gettempdir()), library.process_folder()), monkeypatch)
     answer = ckc("compile", NAME)
     assert answer.code == 2
     assert "allows programs" in answer.err

@@ -26,7 +26,7 @@ PARTS = {
     "ensembles": (["--quick"], "starts in the proved set"),
     "fuzz": (["--runs", "1", "--mechanism", "five_bar"], "five_bar"),
     "planning": (["five_bar", "--tasks", "2"], "| five_bar | 2 | 2 |"),
-    "identification": (["leg", "--trials", "3"], "| leg | 3 | 10 |"),
+    "identification": (["leg", "--trials", "2"], "| leg | 2 | 10 |"),
     "peer": ([f"{sys.executable} {SCIPY_PEER}", "tracking_1e-04"], "tracking_1e-04: not compared, the law of"),
     "bench": (["--only", "Simulator.step of 1 ms, five_bar"], "| Simulator.step of 1 ms, five_bar |"),
 }

@@ -89,7 +89,7 @@ def test_truth_is_within_two_standard_deviations():
 
 
 def test_torques_of_another_motion_are_predicted_to_their_noise():
-    data, other = record("five_bar", 1e-5, 0.01), record("five_bar", 1e-5, 0.01, seed=1, t_end=3.0, dt=0.001)
+    data, other = record("five_bar", 1e-5, 0.01), record("five_bar", 1e-5, 0.01, seed=1, t_end=3.0, dt=0.002)
     result = identify("five_bar", data, PARAMETERS, validation=other, noise={"tau.theta_1": 0.01, "tau.theta_3": 0.01})
     for residuals in (result.residuals, result.validation):
         assert set(residuals) == {"tau.theta_1", "tau.theta_3"}

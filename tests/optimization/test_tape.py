@@ -12,7 +12,7 @@ import ckc_pin
 from ckc_pin import Mechanism
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
-from ckc_pin.optimization import motion_functions
+from ckc_pin.optimization import motion_functions, tape
 from ckc_pin.optimization.motion_functions import MotionFunctions
 from ckc_pin.optimization.reduced import ReducedDynamics
 
@@ -53,9 +53,17 @@ def test_functions_are_found_again_with_the_same_values(folder: Path, monkeypatc
         np.testing.assert_array_equal(ours, exact)
 
 
-def test_without_a_cache_functions_have_the_same_values(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cache_functions_are_derived_once_in_a_process(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cached = evaluate(ckc_pin.load(NAME))
+    of_process = tmp_path / "of_process"
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    monkeypatch.setattr(tape, "process_folder", lambda: of_process)
+    for ours, exact in zip(evaluate(ckc_pin.load(NAME)), cached, strict=True):
+        np.testing.assert_array_equal(ours, exact)
+    assert len(list(of_process.glob("*.tape"))) == len(FUNCTIONS)
+    forbid_deriving(monkeypatch)
     for ours, exact in zip(evaluate(ckc_pin.load(NAME)), cached, strict=True):
         np.testing.assert_array_equal(ours, exact)
 
