@@ -59,7 +59,7 @@ class Core:
     @property
     def has_elimination(self) -> bool:
         """
-        Whether accelerations are computed by compiled or sparse elimination without pivoting.
+        Whether accelerations are computed by elimination without pivoting: by compiled terms, articulated bodies or sparse matrices.
         """
 
 class View:

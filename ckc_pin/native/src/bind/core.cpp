@@ -226,7 +226,8 @@ void bind_core(nb::module_& m) {
       .def("allow_elimination", &Core::allow_elimination, "allowed"_a,
            "Compute accelerations by elimination without pivoting, if there is one, or always by projection.")
       .def_prop_ro("has_elimination", &Core::has_elimination,
-                   "Whether accelerations are computed by compiled or sparse elimination without pivoting.");
+                   "Whether accelerations are computed by elimination without pivoting: by compiled terms, articulated bodies or "
+                   "sparse matrices.");
 }
 
 }  // namespace ckc

@@ -61,8 +61,9 @@ bool minimize_in_box(const Matrix& A, In b, In lower, In upper, Vector& x) {
   program.settings.eps_abs = solver_tolerance, program.settings.eps_rel = 0.0;
   program.settings.max_iter = max_iterations;
   const auto none = proxsuite::nullopt;
+  const Matrix symmetric = 0.5 * (A + A.transpose());  // to the last digit, as ProxQP requires
   const Vector cost = b, low = lower.cwiseMax(-infinite_bound), high = upper.cwiseMin(infinite_bound);
-  program.init(A, cost, none, none, none, none, none, low, high);
+  program.init(symmetric, cost, none, none, none, none, none, low, high);
   program.solve();
   x = program.results.x.cwiseMax(lower).cwiseMin(upper);
   if (!x.allFinite()) return false;

@@ -255,8 +255,8 @@ void Core::multiply_D_tree(In x, Out product) const {
 }
 
 double Core::joint_inertia(int k) {
-  const bool has_factors = eliminates_by_bodies() && elimination_is_accurate_ && factors_configuration_ == configuration_count;
-  if (has_factors) return articulated_->bodies.inertia(k);
+  const bool is_factorized = elimination_is_accurate_ && factors_configuration_ == configuration_count;
+  if (eliminates_by_bodies() && is_factorized) return articulated_->bodies.inertia(k);
   compute_D_tree();
   return D_tree()(k, k);
 }

@@ -29,7 +29,7 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
     for (int i = 0; i < rows; ++i) {
       int first_column = rows;
       for (int j : pattern[i]) first_column = std::min(first_column, position_of_[j]);
-      if (first_column < rows) rows_starting_at_[first_column].push_back(i), row_begin_[i] = first_column;
+      if (first_column < rows) rows_starting_at_[first_column].push_back(i), row_begin_[i] = row_end_[i] = first_column;
     }
   } else {
     qr_.setZero(rows, columns);
