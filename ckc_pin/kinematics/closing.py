@@ -25,7 +25,9 @@ MIN_STEP = 1e-14  # rad, or mechanism sizes: a shorter step is lost in the round
 EXACT_TOLERANCE = 1e-10  # mechanism sizes: largest |phi| of a closed mechanism whose numbers are exact
 ROUNDED_TOLERANCE = 1e-5  # the same with numbers rounded to six digits in the files: 2.35619 rad is off by 5e-6
 NEARBY_STEP = 0.02  # rad, or mechanism sizes: distance at which the rank near a closed configuration is computed
-NEARBY_COUNT = 2  # configurations at that distance
+NEARBY_COUNT = 2  # configurations at about that distance
+MIN_NEARBY_RATIO = 0.1  # of a configuration's distance to NEARBY_STEP, to be counted
+MAX_DIRECTIONS = 20  # in which they are searched
 
 
 @dataclass(frozen=True)
@@ -163,13 +165,20 @@ def _minimum_norm_solution(jacobian: Array, phi: Array) -> Array:
 
 
 def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
-    """Return closed configurations a small step along the tangent space, if there are any."""
+    """Return closed configurations a small step along the tangent space, if there are any.
+
+    At a singular position, the loops close along some directions only.
+    """
     random = Random(0)  # a check of every mechanism: NumPy's generators take longer to import than the check
-    configurations = []
-    for _ in range(NEARBY_COUNT if len(tangent) else 0):
+    configurations, moved = [], 0
+    for _ in range(MAX_DIRECTIONS if len(tangent) else 0):
         step = np.array([random.uniform(-1.0, 1.0) for _ in tangent]) @ tangent
         step *= NEARBY_STEP / np.abs(step).max() * tree.step_scale
         closed = close_loops(tree, closure, tree.integrate(q_tree, step), np.ones(tree.n), accept, restarts=0)
         if closed.residual <= 10 * accept:
             configurations.append(closed.q_tree)
+            change = tree.difference(q_tree, closed.q_tree) / tree.step_scale
+            moved += float(np.abs(change).max()) >= MIN_NEARBY_RATIO * NEARBY_STEP
+        if moved == NEARBY_COUNT:
+            break
     return configurations
