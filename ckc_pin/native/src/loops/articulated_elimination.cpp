@@ -72,8 +72,7 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
   rows_ = std::make_unique<SparseElimination>(pattern, std::vector<Indices>(), Indices());
   operations_ = rows_->operations();
   inverse_pivots_.resize(tree.n), row_matrix_.setZero(count, count);
-  rates_.setZero(count), multipliers_.setZero(count), residual_.setZero(count);
-  x_.setZero(tree.n), a_.setZero(tree.n), correction_.setZero(tree.n);
+  rates_.setZero(count), multipliers_.setZero(count), one_.resize(tree.n, count);
 }
 
 bool ArticulatedElimination::compute(const Matrix& J) {
@@ -118,11 +117,18 @@ void ArticulatedElimination::add_row_forces(const Block<size>& rates, Block<size
   }
 }
 
-// Solve for several forces x, with J a = -residual, and refine once: J D'^-1 J^T has the square of J's condition number.
 template <int size>
-void ArticulatedElimination::solve_block(Block<size>& x, const Block<size>& residual, Block<size>& a) {
+void ArticulatedElimination::Workspace<size>::resize(Eigen::Index n, Eigen::Index rows) {
+  for (Block<size>* vectors : {&x, &a, &correction}) vectors->setZero(n, size);
+  for (Block<size>* vectors : {&residual, &rates}) vectors->setZero(rows, size);
+}
+
+// Solve for the forces x, with J a = -residual, and refine once: J D'^-1 J^T has the square of J's condition number.
+template <int size>
+void ArticulatedElimination::solve_block(Workspace<size>& of) {
+  auto& [x, a, correction, residual, rates] = of;
   bodies.eliminate(bodies.all(), x);
-  Block<size> rates = -residual;
+  rates = -residual;
   for (const Group& group : groups_)
     for (int l = 0; l < size; ++l) {
       Vector8 sums = {};
@@ -140,28 +146,26 @@ void ArticulatedElimination::solve_block(Block<size>& x, const Block<size>& resi
       rates.row(group.rows[static_cast<size_t>(entry.place % block_size)]) -= entry.value * a.row(entry.column);
   x.setZero();
   add_row_forces(rates, x);
-  Block<size> correction(a.rows(), size);
   bodies.accelerate(x, correction);
   a += correction;
 }
 
 void ArticulatedElimination::solve(In force, In residual, Out a) {
-  x_ = force;
-  for (size_t i = 0; i < kept_.size(); ++i) residual_(static_cast<Eigen::Index>(i)) = residual(kept_[i]);
-  solve_block<1>(x_, residual_, a_);
-  a = a_;
+  one_.x = force;
+  for (size_t i = 0; i < kept_.size(); ++i) one_.residual(static_cast<Eigen::Index>(i)) = residual(kept_[i]);
+  solve_block(one_);
+  a = one_.a;
 }
 
 void ArticulatedElimination::solve_unit_forces(const Indices& at, Matrix& columns) {
   const int count = static_cast<int>(at.size());
-  const Block<block_size> residual = Block<block_size>::Zero(static_cast<Eigen::Index>(kept_.size()), block_size);
-  Block<block_size> x(columns.rows(), block_size), a(columns.rows(), block_size);
+  several_.resize(columns.rows(), static_cast<Eigen::Index>(kept_.size()));
   for (int first = 0; first < count; first += block_size) {
     const int last = std::min(first + block_size, count);
-    x.setZero();
-    for (int j = first; j < last; ++j) x(at[j], j - first) = 1.0;
-    solve_block<block_size>(x, residual, a);
-    columns.middleCols(first, last - first) = a.leftCols(last - first);
+    several_.x.setZero();
+    for (int j = first; j < last; ++j) several_.x(at[j], j - first) = 1.0;
+    solve_block(several_);
+    columns.middleCols(first, last - first) = several_.a.leftCols(last - first);
   }
 }
 

@@ -49,7 +49,13 @@ class ArticulatedElimination {
     std::vector<std::pair<int, int>> places;
   };
   template <int size>
-  void solve_block(Block<size>& x, const Block<size>& residual, Block<size>& a);
+  struct Workspace {
+    Block<size> x, a, correction;  // x: forces, then sums of L^-1 times forces; (n)
+    Block<size> residual, rates;   // (kept rows)
+    void resize(Eigen::Index n, Eigen::Index rows);
+  };
+  template <int size>
+  void solve_block(Workspace<size>& of);
   template <int size>
   void add_row_forces(const Block<size>& rates, Block<size>& x);
 
@@ -61,7 +67,8 @@ class ArticulatedElimination {
   long visits_ = 0, operations_ = 0;
   std::vector<double> inverse_pivots_;  // of a pair's places
   Vector rates_, multipliers_;
-  Block<1> x_, a_, correction_, residual_;
+  Workspace<1> one_;
+  Workspace<block_size> several_;
 };
 
 }  // namespace ckc

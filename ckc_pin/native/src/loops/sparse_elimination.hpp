@@ -22,10 +22,10 @@ class SparseElimination {
   // Solve D' a = force + J^T lambda, J a = -residual, with one step of iterative refinement: J D'^-1 J^T has the square of
   // J's condition number.
   void solve(In force, In residual, Out a);
-  // Solve D' a = force without rows and without refinement.
-  void solve_without_rows(In force, Out a);
   // Solve the same for unit forces on these coordinates, one column each, with J a = 0.
   void solve_unit_forces(const Indices& at, Matrix& columns);
+  // Solve D' a = force without rows and without refinement.
+  void solve_without_rows(In force, Out a);
 
  private:
   static constexpr int block_size = 8;  // right-hand sides of which each entry of L is applied to all at a time
