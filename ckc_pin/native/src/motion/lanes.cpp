@@ -18,21 +18,21 @@ using Members = CompiledTerms::Members;
 Vector8& vector_of(Members& x) { return reinterpret_cast<Vector8&>(x); }
 const Vector8& vector_of(const Members& x) { return reinterpret_cast<const Vector8&>(x); }
 
-// sum = start + factors[0] * rates[0] + ... of vectors of `size` numbers
-WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* const* rates, const Members* factors,
-                                        int count, int size, Members* sum) {
+// sum = start + (coefficients[0] * factor) * rates[0] + ... of vectors of `size` numbers
+WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* const* rates, const double* coefficients,
+                                        const Members& factor, int count, int size, Members* sum) {
   constexpr int block_size = 4;  // numbers whose sums stay in registers, and do not wait for one another
   int k = 0;
   for (; k + block_size <= size; k += block_size) {
     Vector8 x[block_size];
     for (int j = 0; j < block_size; ++j) x[j] = vector_of(start[k + j]);
     for (int i = 0; i < count; ++i)
-      for (int j = 0; j < block_size; ++j) x[j] += vector_of(factors[i]) * vector_of(rates[i][k + j]);
+      for (int j = 0; j < block_size; ++j) x[j] += coefficients[i] * vector_of(factor) * vector_of(rates[i][k + j]);
     for (int j = 0; j < block_size; ++j) vector_of(sum[k + j]) = x[j];
   }
   for (; k < size; ++k) {
     Vector8 x = vector_of(start[k]);
-    for (int i = 0; i < count; ++i) x += vector_of(factors[i]) * vector_of(rates[i][k]);
+    for (int i = 0; i < count; ++i) x += coefficients[i] * vector_of(factor) * vector_of(rates[i][k]);
     vector_of(sum[k]) = x;
   }
 }
@@ -40,13 +40,14 @@ WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* con
 // sum of (error / (rtol * max(|from|, |to|) + atol))^2
 WITH_WIDEST_REGISTERS void add_squares(const Members* error, const Members* from, const Members* to,
                                        const Members& rtol, const Members& atol, int size, Members& sum) {
-  sum = {};
-  for (int k = 0; k < size; ++k)
-    for (int lane = 0; lane < width; ++lane) {
-      const double a = std::abs(from[k].of[lane]), b = std::abs(to[k].of[lane]);
-      const double ratio = error[k].of[lane] / (rtol.of[lane] * (a < b ? b : a) + atol.of[lane]);
-      sum.of[lane] += ratio * ratio;
-    }
+  Vector8 squares = {};
+  for (int k = 0; k < size; ++k) {
+    Vector8 a = vector_of(from[k]), b = vector_of(to[k]);
+    a = a < -a ? -a : a, b = b < -b ? -b : b;
+    const Vector8 ratio = vector_of(error[k]) / (vector_of(rtol) * (a < b ? b : a) + vector_of(atol));
+    squares += ratio * ratio;
+  }
+  vector_of(sum) = squares;
 }
 
 // Members all of whose numbers are finite get 0, the others NaN.
@@ -113,7 +114,7 @@ void Lanes::start(const Attempts& attempts, const Explicit& first) {
   terms_ = first.system_.terms_of_rate();
   n_ = first.system_.core.n, size_ = first.system_.size;
   for (Lines* x : {&start_, &y_, &error_, &zero_}) x->resize(size_);
-  rates_.resize(size_ * (first.stages_ + 1)), factors_.resize(first.stages_ + 1);
+  rates_.resize(size_ * (first.stages_ + 1));
   trig_.resize(2 * n_), force_.resize(n_);
   correction_.resize(std::max(first.system_.core.constraints.closure.rows, 1));  // a tree's has an address too
   for (Vector* x : {&q_tree_, &v_, &applied_}) x->setZero(n_);
@@ -156,13 +157,11 @@ void Lanes::combine(const Lines& start, const Coefficients& coefficients, int co
                     Lines& sum) {
   constexpr int max_stages = 16;
   const Members* rates[max_stages];
+  double used_coefficients[max_stages];
   int used = 0;
-  for (int i = 0; i < count; ++i) {
-    if (coefficients(i) == 0.0) continue;
-    for (int lane = 0; lane < width; ++lane) factors_[used].of[lane] = factor.of[lane] * coefficients(i);
-    rates[used++] = &rates_[i * size_];
-  }
-  add_products(start.data(), rates, factors_.data(), used, size_, sum.data());
+  for (int i = 0; i < count; ++i)
+    if (coefficients(i) != 0.0) used_coefficients[used] = coefficients(i), rates[used++] = &rates_[i * size_];
+  add_products(start.data(), rates, used_coefficients, factor, used, size_, sum.data());
 }
 
 void Lanes::evaluate(double stage_time, int stage) {

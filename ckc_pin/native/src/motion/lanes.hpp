@@ -40,7 +40,7 @@ class Lanes {
   bool has_force_ = false;
   double t_[width];
   Members h_, rtol_, atol_;
-  Lines start_, zero_, y_, rates_, error_, factors_, trig_, force_, correction_, constants_;
+  Lines start_, zero_, y_, rates_, error_, trig_, force_, correction_, constants_;
   Vector q_tree_, v_, applied_;
 };
 

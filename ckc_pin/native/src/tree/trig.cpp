@@ -11,8 +11,6 @@ namespace ckc {
 
 namespace {
 
-constexpr Eigen::Index lanes = 4;  // numbers per vector function call
-
 void evaluate_scalar(const double* x, Eigen::Index count, double* cosines, double* sines) {
   for (Eigen::Index k = 0; k < count; ++k) cosines[k] = std::cos(x[k]);
   for (Eigen::Index k = 0; k < count; ++k) sines[k] = std::sin(x[k]);
@@ -22,23 +20,39 @@ using Evaluate = void (*)(const double* x, Eigen::Index count, double* cosines, 
 
 #if defined(__x86_64__) && defined(__GLIBC__)
 
-// Vector functions of glibc (four values at a time, within 4 units in the last place). They are loaded at run time
-// because not every system has them.
-using FourLanes = __m256d (*)(__m256d);
-FourLanes cosine_lanes, sine_lanes;
+// Vector functions of glibc (within 4 units in the last place). They are loaded at run time because not every system has
+// them. Those of eight numbers give the same digits as those of four.
+using OfFour = __m256d (*)(__m256d);
+using OfEight = __m512d (*)(__m512d);
+OfFour cosines_of_four, sines_of_four;
+OfEight cosines_of_eight, sines_of_eight;
 
 __attribute__((target("avx2"))) void evaluate_avx2(const double* x, Eigen::Index count, double* cosines,
                                                    double* sines) {
-  for (Eigen::Index k = 0; k < count; k += lanes) _mm256_storeu_pd(cosines + k, cosine_lanes(_mm256_loadu_pd(x + k)));
-  for (Eigen::Index k = 0; k < count; k += lanes) _mm256_storeu_pd(sines + k, sine_lanes(_mm256_loadu_pd(x + k)));
+  for (Eigen::Index k = 0; k < count; k += 4) _mm256_storeu_pd(cosines + k, cosines_of_four(_mm256_loadu_pd(x + k)));
+  for (Eigen::Index k = 0; k < count; k += 4) _mm256_storeu_pd(sines + k, sines_of_four(_mm256_loadu_pd(x + k)));
+}
+
+__attribute__((target("avx512f"))) void evaluate_avx512(const double* x, Eigen::Index count, double* cosines,
+                                                        double* sines) {
+  const Eigen::Index last = count - 8;
+  Eigen::Index k = 0;
+  for (; k <= last; k += 8) _mm512_storeu_pd(cosines + k, cosines_of_eight(_mm512_loadu_pd(x + k)));
+  if (k < count) _mm256_storeu_pd(cosines + k, cosines_of_four(_mm256_loadu_pd(x + k)));
+  for (k = 0; k <= last; k += 8) _mm512_storeu_pd(sines + k, sines_of_eight(_mm512_loadu_pd(x + k)));
+  if (k < count) _mm256_storeu_pd(sines + k, sines_of_four(_mm256_loadu_pd(x + k)));
 }
 
 Evaluate select_evaluation() {
   void* library = __builtin_cpu_supports("avx2") ? dlopen("libmvec.so.1", RTLD_NOW | RTLD_LOCAL) : nullptr;
   if (!library) return evaluate_scalar;
-  cosine_lanes = reinterpret_cast<FourLanes>(dlsym(library, "_ZGVdN4v_cos"));
-  sine_lanes = reinterpret_cast<FourLanes>(dlsym(library, "_ZGVdN4v_sin"));
-  return cosine_lanes && sine_lanes ? evaluate_avx2 : evaluate_scalar;
+  cosines_of_four = reinterpret_cast<OfFour>(dlsym(library, "_ZGVdN4v_cos"));
+  sines_of_four = reinterpret_cast<OfFour>(dlsym(library, "_ZGVdN4v_sin"));
+  if (!cosines_of_four || !sines_of_four) return evaluate_scalar;
+  cosines_of_eight = reinterpret_cast<OfEight>(dlsym(library, "_ZGVeN8v_cos"));
+  sines_of_eight = reinterpret_cast<OfEight>(dlsym(library, "_ZGVeN8v_sin"));
+  const bool has_eight = __builtin_cpu_supports("avx512f") && cosines_of_eight && sines_of_eight;
+  return has_eight ? evaluate_avx512 : evaluate_avx2;
 }
 
 #else
@@ -55,7 +69,7 @@ void compute_cosines_and_sines(const double* x, Eigen::Index count, double* cosi
 }
 
 const double* Trig::compute(In x) const {
-  const Eigen::Index size = x.size(), padded_size = (size + lanes - 1) / lanes * lanes;
+  const Eigen::Index size = x.size(), padded_size = (size + 3) / 4 * 4;
   if (x_.size() != size) padded_.setZero(padded_size), values_.setZero(size + padded_size);
   x_ = padded_.head(size) = x;
   // the sines overwrite the padding of the cosines
