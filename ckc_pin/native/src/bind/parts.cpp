@@ -63,7 +63,7 @@ struct BoundSparseElimination {
 
   BoundSparseElimination(const nb::typed<nb::dict, nb::str, nb::any>& table)
       : core(core_from_table(table)),
-        elimination(core->tree.inertia_pattern, core->constraints.relative_pattern,
+        elimination(core->tree.inertia_pattern, core->constraints.pattern,
                     get<Indices>(table, "independent_rows")) {
     core->allow_elimination(false);  // it would leave D' out
   }

@@ -33,7 +33,7 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
   std::map<Indices, Indices> rows_by_coordinates;
   for (int i = 0; i < count; ++i) {
     std::set<int> moved;
-    for (int j : rows.relative_pattern[kept_[i]]) moved.insert(tree.ancestors[j].begin(), tree.ancestors[j].end());
+    for (int j : rows.pattern[kept_[i]]) moved.insert(tree.ancestors[j].begin(), tree.ancestors[j].end());
     rows_by_coordinates[Indices(moved.begin(), moved.end())].push_back(i);
   }
   for (const auto& [coordinates, of] : rows_by_coordinates)
@@ -43,7 +43,7 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
       group.coordinates = coordinates;
       for (size_t l = 0; l < group.rows.size(); ++l) {
         const int row = kept_[group.rows[l]];
-        for (int j : rows.relative_pattern[row]) {
+        for (int j : rows.pattern[row]) {
           const auto place = std::lower_bound(coordinates.begin(), coordinates.end(), j) - coordinates.begin();
           group.entries.push_back({static_cast<int>(place * block_size + l), row, j, 0.0});
         }

@@ -57,7 +57,7 @@ void Core::choose_elimination() {
   const double products = D_tree_is_dense_ ? rank * size * d : d * inertia_entries + size * d * d;
   const double projection = products + d * d * d / 6.0;
   if (projection < sparse_cost * size) return;
-  auto sparse = std::make_unique<SparseElimination>(tree.inertia_pattern, constraints.relative_pattern, independent_rows_);
+  auto sparse = std::make_unique<SparseElimination>(tree.inertia_pattern, constraints.pattern, independent_rows_);
   const double in_matrices = sparse_cost * static_cast<double>(sparse->operations());
   if (!tree.has_shared_rotors()) {
     auto articulated = std::make_unique<ArticulatedElimination>(tree, constraints, independent_rows_);

@@ -4,8 +4,6 @@
 #include <cmath>
 #include <set>
 
-#include "tree/rotation.hpp"
-
 namespace ckc {
 
 namespace {
@@ -49,9 +47,10 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   p_.resize(2 * pair_count_), p_dot_.resize(2 * pair_count_), r_.resize(pair_count_), r_dot_.resize(pair_count_);
   e_.resize(c.direction_joint.size()), e_dot_.resize(c.direction_joint.size());
   velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
-  wrenches_.resize(c.rows), pattern.resize(c.rows), relative_pattern.resize(c.rows);
+  wrenches_.resize(c.rows), pattern.resize(c.rows);
+  log_jacobians_.assign(c.logs.size(), LogJacobian(Vector3::Zero()));
   const auto joints = [&](int out, std::initializer_list<int> list) {
-    for (int joint : list) wrenches_[out].push_back({joint, Vector6::Zero(), Vector6::Zero()});
+    for (int joint : list) wrenches_[out].push_back({joint, {}, Vector6::Zero(), Vector6::Zero()});
   };
   for (const auto& row : c.components)
     joints(row.out, {c.point_joint[row.pair], c.point_joint[pair_count_ + row.pair], c.direction_joint[row.direction]});
@@ -69,23 +68,21 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
   for (int i = 0; i < c.rows; ++i) {
     std::set<int> columns;
-    for (const auto& wrench : wrenches_[i]) {
-      const auto& support = tree.support[wrench.joint];
-      columns.insert(support.begin(), support.end());
+    for (Wrench& wrench : wrenches_[i]) {
+      for (int j : tree.support[wrench.joint]) {
+        const auto is_moved = [&](const Wrench& other) {
+          const Indices& support = tree.support[other.joint];
+          return std::binary_search(support.begin(), support.end(), j);
+        };
+        if (!std::all_of(wrenches_[i].begin(), wrenches_[i].end(), is_moved)) wrench.coordinates.push_back(j);
+      }
+      columns.insert(wrench.coordinates.begin(), wrench.coordinates.end());
     }
     for (int j = 0; j < tree.n; ++j)
       if (J(i, j) != 0.0) columns.insert(j);
     for (const auto& curve : c.curves)
       if (curve.out == i) columns.insert(curve.coordinate);
     pattern[i].assign(columns.begin(), columns.end());
-    for (int j : pattern[i]) {
-      const auto moves = [&](const Wrench& wrench) {
-        const auto& support = tree.support[wrench.joint];
-        return std::binary_search(support.begin(), support.end(), j);
-      };
-      if (wrenches_[i].empty() || !std::all_of(wrenches_[i].begin(), wrenches_[i].end(), moves))
-        relative_pattern[i].push_back(j);
-    }
   }
 }
 
@@ -143,11 +140,13 @@ void ConstraintRows::update(const Tree& tree, In q) {
 }
 
 void ConstraintRows::update_relative_rotations(const Tree& tree) {
-  for (const auto& rows : closure.logs) {
+  for (size_t log = 0; log < closure.logs.size(); ++log) {
+    const auto& rows = closure.logs[log];
     const Matrix3 r_a = tree.rotation(rows.joint_a) * rows.rotation_a;
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
     const Vector3 u = log3(r_a.transpose() * r_b);
-    const Matrix3 m = LogJacobian(u).value * r_b.transpose();
+    log_jacobians_[log] = LogJacobian(u);
+    const Matrix3 m = log_jacobians_[log].value * r_b.transpose();
     for (int k = 0; k < 3; ++k) {
       auto& w = wrenches_[rows.out[k]];
       phi(rows.out[k]) = u(k);
@@ -190,13 +189,12 @@ void ConstraintRows::update_rates(const Tree& tree, In v) {
 }
 
 void ConstraintRows::update_relative_rotation_rates(const Tree& tree) {
-  for (const auto& rows : closure.logs) {
+  for (size_t log = 0; log < closure.logs.size(); ++log) {
+    const auto& rows = closure.logs[log];
+    const LogJacobian& j_log = log_jacobians_[log];
     const Matrix3 r_b = tree.rotation(rows.joint_b) * rows.rotation_b;
     const Vector3 omega_b = velocity_[rows.joint_b].tail<3>();
     const Vector3 omega = omega_b - velocity_[rows.joint_a].tail<3>();
-    Vector3 u;
-    for (int k = 0; k < 3; ++k) u(k) = phi(rows.out[k]);
-    const LogJacobian j_log(u);
     const Vector3 u_dot = j_log.value * (r_b.transpose() * omega);
     // d/dt (R_B^T X) = R_B^T (X_dot - omega_B x X)
     const Matrix3 m_dot = j_log.derivative(u_dot) * r_b.transpose() - j_log.value * r_b.transpose() * skew(omega_b);
@@ -214,7 +212,7 @@ void ConstraintRows::update_jacobian(const Tree& tree) {
     if (wrenches_[i].empty()) continue;  // the Jacobian of an affine row is constant, except for its curve
     for (int j : pattern[i]) J(i, j) = 0.0;
     for (const auto& wrench : wrenches_[i])
-      for (int j : tree.support[wrench.joint]) J(i, j) += wrench.w.dot(columns.col(j));
+      for (int j : wrench.coordinates) J(i, j) += wrench.w.dot(columns.col(j));
   }
   for (size_t k = 0; k < closure.curves.size(); ++k)
     J(closure.curves[k].out, closure.curves[k].coordinate) = -curve_values_[k](1);
@@ -225,7 +223,7 @@ void ConstraintRows::update_jacobian_dot(const Tree& tree, const Matrix6x& colum
   for (int i = 0; i < closure.rows; ++i) {
     for (int j : pattern[i]) J_dot(i, j) = 0.0;
     for (const auto& wrench : wrenches_[i])
-      for (int j : tree.support[wrench.joint])
+      for (int j : wrench.coordinates)
         J_dot(i, j) += wrench.w.dot(columns_dot.col(j)) + wrench.w_dot.dot(columns.col(j));
   }
   for (size_t k = 0; k < closure.curves.size(); ++k)

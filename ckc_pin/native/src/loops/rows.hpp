@@ -5,6 +5,7 @@
 // of w . J_joint, both in world axes at the world's origin. J, J_dot and J_dot v then need one implementation each.
 #pragma once
 
+#include "tree/rotation.hpp"
 #include "tree/tree.hpp"
 
 namespace ckc {
@@ -56,6 +57,7 @@ struct Closure {
 // A wrench on a joint, (force, moment) in world axes at the world's origin, and its rate.
 struct Wrench {
   int joint;
+  Indices coordinates;  // that move the joint, without those that move everything the row is attached to
   Vector6 w, w_dot;
 };
 
@@ -64,11 +66,10 @@ class ConstraintRows {
   ConstraintRows(const Tree& tree, Closure closure);
 
   Closure closure;
-  std::vector<Indices> pattern;  // by row: columns of J that are not zero
-  // The same without coordinates that move everything the row is attached to: in their columns J is a rounding error.
-  std::vector<Indices> relative_pattern;
+  // By row: columns of J that are not zero. Coordinates that move everything the row is attached to do not change it.
+  std::vector<Indices> pattern;
   Vector phi;       // (rows)
-  Matrix J, J_dot;  // (rows, n); zero outside the pattern
+  Matrix J, J_dot;  // (rows, n); outside the pattern zero, except for rounding errors of compiled terms
 
   // Replace one kind of parameter: points concatenated; lengths, coefficients and offsets of all rows.
   enum class Parameter { point, length, affine, affine_offset };
@@ -76,7 +77,7 @@ class ConstraintRows {
   // Return the pattern restricted to `columns`, as indices into them.
   std::vector<Indices> pattern_in(const Indices& columns, int n) const;
   void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
-  void update_jacobian(const Tree& tree);
+  void update_jacobian(const Tree& tree);  // requires update
   // Rates of the wrenches; `motion` provides the joints' velocities and bias accelerations at v.
   template <class Motion>
   void update_rates(const Tree& tree, const Motion& motion, In v) {
@@ -102,6 +103,7 @@ class ConstraintRows {
   Indices joints_;                                // joints that rows are attached to
   std::vector<Vector6> velocity_, acceleration_;  // by joint, valid for joints_
   std::vector<std::vector<Wrench>> wrenches_;     // by row
+  std::vector<LogJacobian> log_jacobians_;        // by relative rotation
 };
 
 }  // namespace ckc
