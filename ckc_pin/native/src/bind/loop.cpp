@@ -321,12 +321,13 @@ double seconds(Loop& loop, MatrixArg states, int rounds, bool of_jacobian) {
   nb::gil_scoped_release released;
   for (int round = 0; round < rounds; ++round) {
     const auto start = std::chrono::steady_clock::now();
+    bool exists = true;
     for (Eigen::Index k = 0; k < columns.cols(); ++k) {
       const auto y = columns.col(k).tail(system.size);
-      const bool exists =
-          of_jacobian ? system.jacobian(columns(0, k), y, by_y, evaluations) : system.rhs(columns(0, k), y, y_dot);
-      require(exists, "states: no right-hand side there");
+      exists = exists && (of_jacobian ? system.jacobian(columns(0, k), y, by_y, evaluations)
+                                      : system.rhs(columns(0, k), y, y_dot));
     }
+    require(exists, "states: no right-hand side there");
     shortest = std::min(shortest, std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count());
   }
   return shortest / static_cast<double>(columns.cols());

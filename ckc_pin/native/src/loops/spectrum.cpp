@@ -59,7 +59,8 @@ void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_sca
 
 void SmallestSingularValue::compute_dense() {
   if (has_closed_form()) {
-    smallest_ = 0.5 * (gram_(0, 0) + gram_(1, 1)) - std::hypot(0.5 * (gram_(0, 0) - gram_(1, 1)), gram_(0, 1));
+    const double difference = 0.5 * (gram_(0, 0) - gram_(1, 1)), coupling = gram_(0, 1);
+    smallest_ = 0.5 * (gram_(0, 0) + gram_(1, 1)) - std::sqrt(difference * difference + coupling * coupling);
     return;
   }
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
@@ -110,7 +111,10 @@ void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
       u_ << -c, a;
     else
       u_ << b, -c;
-    u_ = a + b > 0.0 ? u_.normalized() : Vector::Unit(2, 0);
+    if (a + b > 0.0)
+      u_.normalize();
+    else
+      u_ << 1.0, 0.0;
   } else if (is_dense_) {  // inverse iteration, shifted by the eigenvalue
     gram_.diagonal().array() -= smallest_ + 1e-12 * mean_square_;
     factor_.compute(gram_);
