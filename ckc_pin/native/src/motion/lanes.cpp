@@ -166,7 +166,7 @@ void Lanes::combine(const Lines& start, const Coefficients& coefficients, int co
 
 void Lanes::evaluate(double stage_time, int stage) {
   Members *rate = &rates_[stage * size_], sound, not_finite;
-  compute_cosines_and_sines(y_[0].of, n_ * width, trig_[0].of, trig_[n_].of);
+  compute_cosines_and_sines_of_vectors(y_[0].of, n_ * width, trig_[0].of, trig_[n_].of);
   if (has_force_) apply_forces(stage_time);
   std::copy_n(&y_[n_], n_, rate);
   terms_->accelerations(y_.data(), trig_.data(), &y_[n_], force_.data(), correction_.data(), constants_.data(),

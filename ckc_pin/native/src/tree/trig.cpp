@@ -17,6 +17,9 @@ void evaluate_scalar(const double* x, Eigen::Index count, double* cosines, doubl
 }
 
 using Evaluate = void (*)(const double* x, Eigen::Index count, double* cosines, double* sines);
+struct Evaluations {
+  Evaluate of_numbers = evaluate_scalar, of_vectors = evaluate_scalar;
+};
 
 #if defined(__x86_64__) && defined(__GLIBC__)
 
@@ -40,37 +43,41 @@ __attribute__((target("avx2"))) void evaluate_avx2(const double* x, Eigen::Index
 
 __attribute__((target("avx512f"))) void evaluate_avx512(const double* x, Eigen::Index count, double* cosines,
                                                         double* sines) {
-  const Eigen::Index last = count - 8;
-  Eigen::Index k = 0;
-  for (; k <= last; k += 8) _mm512_storeu_pd(cosines + k, cosines_of_eight(_mm512_loadu_pd(x + k)));
-  if (k < count) _mm256_storeu_pd(cosines + k, cosines_of_four(read_four(x + k)));
-  for (k = 0; k <= last; k += 8) _mm512_storeu_pd(sines + k, sines_of_eight(_mm512_loadu_pd(x + k)));
-  if (k < count) _mm256_storeu_pd(sines + k, sines_of_four(read_four(x + k)));
+  for (Eigen::Index k = 0; k < count; k += 8) _mm512_storeu_pd(cosines + k, cosines_of_eight(_mm512_loadu_pd(x + k)));
+  for (Eigen::Index k = 0; k < count; k += 8) _mm512_storeu_pd(sines + k, sines_of_eight(_mm512_loadu_pd(x + k)));
 }
 
-Evaluate select_evaluation() {
+Evaluations select_evaluations() {
   void* library = __builtin_cpu_supports("avx2") ? dlopen("libmvec.so.1", RTLD_NOW | RTLD_LOCAL) : nullptr;
-  if (!library) return evaluate_scalar;
+  if (!library) return {};
   cosines_of_four = reinterpret_cast<OfFour>(dlsym(library, "_ZGVdN4v_cos"));
   sines_of_four = reinterpret_cast<OfFour>(dlsym(library, "_ZGVdN4v_sin"));
-  if (!cosines_of_four || !sines_of_four) return evaluate_scalar;
+  if (!cosines_of_four || !sines_of_four) return {};
   cosines_of_eight = reinterpret_cast<OfEight>(dlsym(library, "_ZGVeN8v_cos"));
   sines_of_eight = reinterpret_cast<OfEight>(dlsym(library, "_ZGVeN8v_sin"));
   const bool has_eight = __builtin_cpu_supports("avx512f") && cosines_of_eight && sines_of_eight;
-  return has_eight ? evaluate_avx512 : evaluate_avx2;
+  return {evaluate_avx2, has_eight ? evaluate_avx512 : evaluate_avx2};
 }
 
 #else
 
-Evaluate select_evaluation() { return evaluate_scalar; }
+Evaluations select_evaluations() { return {}; }
 
 #endif
+
+const Evaluations& evaluations() {
+  static const Evaluations selected = select_evaluations();
+  return selected;
+}
 
 }  // namespace
 
 void compute_cosines_and_sines(const double* x, Eigen::Index count, double* cosines, double* sines) {
-  static const Evaluate evaluate = select_evaluation();
-  evaluate(x, count, cosines, sines);
+  evaluations().of_numbers(x, count, cosines, sines);
+}
+
+void compute_cosines_and_sines_of_vectors(const double* x, Eigen::Index count, double* cosines, double* sines) {
+  evaluations().of_vectors(x, count, cosines, sines);
 }
 
 const double* Trig::compute(In x) const {

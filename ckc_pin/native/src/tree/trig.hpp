@@ -7,6 +7,8 @@ namespace ckc {
 
 // Compute cosines and sines of numbers, as many as a multiple of four. They may lie one behind the other in memory.
 void compute_cosines_and_sines(const double* x, Eigen::Index count, double* cosines, double* sines);
+// The same for numbers that were stored as vectors of eight, as many as a multiple of eight. The digits are the same.
+void compute_cosines_and_sines_of_vectors(const double* x, Eigen::Index count, double* cosines, double* sines);
 
 class Trig {
  public:
