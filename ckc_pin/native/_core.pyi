@@ -591,9 +591,11 @@ class Loop:
     def record_columns(self) -> list[RecordColumns]:
         """where each quantity is in a row"""
 
-    def rank(self, y: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)]) -> tuple[float, float]:
+    def ranks(
+        self, states: Annotated[NDArray[numpy.float64], dict(shape=(None, None), writable=False)]
+    ) -> Annotated[NDArray[numpy.float64], dict(shape=(None, None), order="F")]:
         """
-        Return the rank monitor's smallest singular value of J and its rate at a DAE's state.
+        Return the rank monitor's smallest singular value of J and its rate at a DAE's states, one row for each.
         """
 
     def reduced_jacobian(

@@ -63,8 +63,7 @@ struct BoundSparseElimination {
 
   BoundSparseElimination(const nb::typed<nb::dict, nb::str, nb::any>& table)
       : core(core_from_table(table)),
-        elimination(core->tree.inertia_pattern, core->constraints.pattern,
-                    get<Indices>(table, "independent_rows")) {
+        elimination(core->tree.inertia_pattern, core->constraints.pattern, get<Indices>(table, "independent_rows")) {
     core->allow_elimination(false);  // it would leave D' out
   }
   std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
@@ -132,13 +131,19 @@ nb::typed<nb::tuple, Matrix, Matrix, Matrix> log_jacobian(const Vector& u, const
                         Matrix(log.second_derivative(direction_a, direction_b)));
 }
 
-// Return the rank monitor's smallest singular value and its rate at a state of a DAE.
-nb::typed<nb::tuple, double, double> rank(Loop& loop, VectorArg y) {
+// Return a rank monitor's smallest singular values and their rates at states of a DAE, one after the other.
+Matrix ranks(Loop& loop, MatrixArg states) {
   System& system = *loop.step_loop->system;
-  require(y, system.size, "y");
-  system.sync_core_at_last_rhs(0.0, y);
-  const RankMonitor::Rank sigma_min = RankMonitor(*loop.core).evaluate(system);
-  return nb::make_tuple(sigma_min.value, sigma_min.rate);
+  require(states.cols() == system.size, "states: rows y are needed");
+  RankMonitor monitor(*loop.core);
+  Matrix values_and_rates(states.rows(), 2);
+  for (Eigen::Index k = 0; k < states.rows(); ++k) {
+    const Vector y = states.row(k);
+    system.sync_core_at_last_rhs(0.0, y);
+    const RankMonitor::Rank sigma_min = monitor.evaluate(system);
+    values_and_rates.row(k) << sigma_min.value, sigma_min.rate;
+  }
+  return values_and_rates;
 }
 
 // Return the end of one collocation step from the present state.
@@ -215,8 +220,8 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
                    },
                    "Coordinates that all sweeps visit, and multiplications with the matrix of the rows.");
   binding
-      .def("rank", &rank, "y"_a,
-           "Return the rank monitor's smallest singular value of J and its rate at a DAE's state.")
+      .def("ranks", &ranks, "states"_a,
+           "Return the rank monitor's smallest singular value of J and its rate at a DAE's states, one row for each.")
       .def("reduced_jacobian", &reduced_jacobian, "jacobian"_a,
            "Return the Jacobian in minimal coordinates, whose eigenvalues decide about stiffness.")
       .def("collocate", &collocate, "span"_a, "stages"_a,

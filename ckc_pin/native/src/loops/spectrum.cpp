@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <utility>
 
 namespace ckc {
@@ -11,6 +12,10 @@ constexpr double breakdown_tolerance = 1e-14;  // relative off-diagonal entry at
 constexpr int first_check = 4;                 // Lanczos steps before the first convergence check; doubled after each
 // Residual of the eigenvector, relative to the eigenvalue. The relative error of the eigenvalue is its square.
 constexpr double residual_tolerance = 1e-7;
+// Of Rayleigh quotient iteration: largest number of rows, for which dense factorizations cost little, largest number of
+// steps, and distance below the eigenvalue, relative to it, in which no other eigenvalue may lie.
+constexpr int max_continued_rows = 24, max_continued_steps = 4;
+constexpr double min_eigenvalue_distance = 1e-6, rounding = std::numeric_limits<double>::epsilon();
 
 // Start vector. Equal entries could be orthogonal to the smallest singular direction of a symmetric mechanism.
 static void fill_generic_vector(Out u) {
@@ -37,6 +42,12 @@ SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int c
       common_columns[b].clear();
     }
   }
+  may_continue_ = rank == m && m > 2 && m <= max_continued_rows;
+  if (may_continue_) {
+    shifted_.setIdentity(m, m);
+    shifted_lu_.compute(shifted_), shifted_cholesky_.compute(shifted_);
+    next_.setZero(m);
+  }
   factor_.set_pattern(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
   if (!is_dense_) basis_.setZero(m, max_steps_), next_.setZero(m), projections_.setZero(max_steps_);
   // A solver that has computed nothing cannot be copied, so use it once.
@@ -45,7 +56,7 @@ SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int c
   ritz_.compute(Eigen::Matrix<double, max_steps_, max_steps_>::Identity(), Eigen::EigenvaluesOnly);
 }
 
-void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_scale) {
+void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_scale, bool continues) {
   for (size_t i = 0; i < pattern_.size(); ++i)
     for (int j : pattern_[i]) scaled_(i, j) = row_scale(i) * a(i, j) * column_scale(j);
   for (const Pair& pair : pairs_) {
@@ -54,7 +65,33 @@ void SmallestSingularValue::compute(const Matrix& a, In row_scale, In column_sca
     gram_(pair.a, pair.b) = gram_(pair.b, pair.a) = sum;
   }
   mean_square_ = gram_.trace() / rank_;
+  if (continues && vector_is_computed_ && continue_from_last_vector()) return;
+  vector_is_computed_ = false;
   is_dense_ ? compute_dense() : compute_sparse();
+}
+
+bool SmallestSingularValue::continue_from_last_vector() {
+  if (!may_continue_) return false;
+  const double floor = 4 * rounding * gram_.trace();
+  for (int k = 0;; ++k) {
+    next_.noalias() = gram_ * u_;
+    smallest_ = u_.dot(next_);
+    next_ -= smallest_ * u_;
+    if (next_.norm() <= std::max(residual_tolerance * smallest_, floor)) break;
+    if (k == max_continued_steps) return false;
+    shifted_ = gram_;
+    shifted_.diagonal().array() -= smallest_ - floor;
+    shifted_lu_.compute(shifted_);
+    next_.noalias() = shifted_lu_.permutationP() * u_;
+    shifted_lu_.matrixLU().triangularView<Eigen::UnitLower>().solveInPlace(next_);
+    shifted_lu_.matrixLU().triangularView<Eigen::Upper>().solveInPlace(next_);
+    if (!next_.allFinite()) return false;
+    u_ = next_, u_.normalize();
+  }
+  shifted_ = gram_;
+  shifted_.diagonal().array() -= smallest_ - (min_eigenvalue_distance * smallest_ + floor);
+  shifted_cholesky_.compute(shifted_);
+  return shifted_cholesky_.info() == Eigen::Success;
 }
 
 void SmallestSingularValue::compute_dense() {
@@ -69,10 +106,13 @@ void SmallestSingularValue::compute_dense() {
 
 void SmallestSingularValue::compute_sparse() {
   factor_.compute(gram_);
-  smallest_ = factor_.singular() ? 0.0 : 1.0 / largest_eigenvalue_of_inverse();
+  if (factor_.singular()) gram_.diagonal().array() += rounding * mean_square_, factor_.compute(gram_);
+  smallest_ = 1.0 / largest_eigenvalue_of_inverse();
+  vector_is_computed_ = true;
 }
 
-// Lanczos' method with full orthogonalization (twice), which is affordable for few steps. The vector is stored in u_.
+// The one of largest magnitude, by Lanczos' method with full orthogonalization (twice), which is affordable for few
+// steps. The vector is stored in u_.
 double SmallestSingularValue::largest_eigenvalue_of_inverse() {
   fill_generic_vector(u_);
   u_.normalize();
@@ -89,9 +129,11 @@ double SmallestSingularValue::largest_eigenvalue_of_inverse() {
     if (has_ended(k) || k + 1 == next_check) {
       next_check *= 2;
       ritz_.computeFromTridiagonal(diagonal_.head(k + 1), off_diagonal_.head(k));
-      const double value = ritz_.eigenvalues()(k);
-      const auto vector = ritz_.eigenvectors().col(k);
-      if (has_ended(k) || off_diagonal_(k) * std::abs(vector(k)) <= residual_tolerance * value) {
+      // Where A loses rank, rounding may make the smallest eigenvalue of A A^T negative.
+      const int largest = -ritz_.eigenvalues()(0) > ritz_.eigenvalues()(k) ? 0 : k;
+      const double value = ritz_.eigenvalues()(largest);
+      const auto vector = ritz_.eigenvectors().col(largest);
+      if (has_ended(k) || off_diagonal_(k) * std::abs(vector(k)) <= residual_tolerance * std::abs(value)) {
         u_.noalias() = basis * vector;
         return value;
       }
@@ -115,7 +157,7 @@ void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
       u_.normalize();
     else
       u_ << 1.0, 0.0;
-  } else if (is_dense_) {  // inverse iteration, shifted by the eigenvalue
+  } else if (is_dense_ && !vector_is_computed_) {  // inverse iteration, shifted by the eigenvalue
     gram_.diagonal().array() -= smallest_ + 1e-12 * mean_square_;
     factor_.compute(gram_);
     fill_generic_vector(u_);
@@ -123,6 +165,7 @@ void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
       factor_.solve(u_, u_);
       u_.normalize();
     }
+    vector_is_computed_ = true;
   }
   u = u_;
   v.setZero(scaled_.cols());

@@ -64,7 +64,7 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   method_ = nullptr, radau_.reset(), segment_end_ = t;
   state_is_accepted_ = rate_is_known_ = cannot_repeat_ = false;
   waiting_step_.reset(), advances_unchanged_ = 0, is_paused_ = false;
-  crossing_.reset();
+  crossing_.reset(), monitor_.reset();
   events.reset();
 }
 
