@@ -327,7 +327,7 @@ def _write_file(path: Path, content: bytes) -> Path:
 
 @cache
 def process_folder() -> Path:
-    """Return a folder for what the user's cache cannot take, which is removed when the process ends."""
+    """Return a temporary folder for files that cannot be stored in the user's cache; it is removed at exit."""
     import atexit
     import shutil
     import tempfile

@@ -165,9 +165,9 @@ def _minimum_norm_solution(jacobian: Array, phi: Array) -> Array:
 
 
 def find_nearby(tree: Tree, closure: Closure, q_tree: Array, tangent: Array, accept: float) -> list[Array]:
-    """Return closed configurations a small step along the tangent space, if there are any.
+    """Return configurations with closed loops that are about `NEARBY_STEP` away from `q_tree`, along its tangent space.
 
-    At a singular position, the loops close along some directions only.
+    There may be none: at a singular position, the loops close along some directions only.
     """
     random = Random(0)  # a check of every mechanism: NumPy's generators take longer to import than the check
     configurations, moved = [], 0

@@ -300,7 +300,7 @@ def _relative_names(files: list[Path]) -> list[str]:
 
 
 def measure(mechanism: Mechanism, dynamics: ReducedDynamics, limits: MotionLimits, at: MotionInstants) -> Array:
-    """Return the quantities of `limits.names`, (m, names)."""
+    """Return the quantities that have limits at each instant, in the order of `limits.names`, shape (m, names)."""
     numbers = np.array([mechanism.tree.to_coordinates(one) for one in at.q_tree])
     shafts, distances = at.v_tree @ mechanism.motors.transmission.T, dynamics.distances(at.q_tree, limits.spheres)
     power = shafts * at.tau

@@ -92,7 +92,10 @@ class Tape(msgspec.Struct, frozen=True):
 
 
 def find_or_derive(key: str, derive: Callable[[], Tape]) -> Tape:
-    """Return the tape of a key, or derive and store it: in the user's cache, or for this process if that fails."""
+    """Return the tape stored under a key. If there is none, derive it and store it in the user's cache.
+
+    If the cache is not writable, the tape is stored in a temporary folder of this process.
+    """
     tape: Tape | None = None
     for locate in (cache_folder, process_folder):
         with suppress(OSError, InputError):

@@ -44,9 +44,8 @@ SmallestSingularValue::SmallestSingularValue(std::vector<Indices> pattern, int c
   }
   may_continue_ = rank == m && m > 2 && m <= max_continued_rows;
   if (may_continue_) {
-    shifted_.setIdentity(m, m);
-    shifted_lu_.compute(shifted_), shifted_cholesky_.compute(shifted_);
-    next_.setZero(m);
+    shifted_.setIdentity(m, m), next_.setZero(m);
+    shifted_cholesky_.compute(shifted_);
   }
   factor_.set_pattern(m, m, is_dense_ ? full_pattern(m) : coupled_rows);
   if (!is_dense_) basis_.setZero(m, max_steps_), next_.setZero(m), projections_.setZero(max_steps_);
@@ -81,12 +80,10 @@ bool SmallestSingularValue::continue_from_last_vector() {
     if (k == max_continued_steps) return false;
     shifted_ = gram_;
     shifted_.diagonal().array() -= smallest_ - floor;
-    shifted_lu_.compute(shifted_);
-    next_.noalias() = shifted_lu_.permutationP() * u_;
-    shifted_lu_.matrixLU().triangularView<Eigen::UnitLower>().solveInPlace(next_);
-    shifted_lu_.matrixLU().triangularView<Eigen::Upper>().solveInPlace(next_);
-    if (!next_.allFinite()) return false;
-    u_ = next_, u_.normalize();
+    factor_.compute(shifted_);
+    factor_.solve(u_, u_);
+    u_.normalize();
+    if (!u_.allFinite()) return false;
   }
   shifted_ = gram_;
   shifted_.diagonal().array() -= smallest_ - (min_eigenvalue_distance * smallest_ + floor);
@@ -106,6 +103,7 @@ void SmallestSingularValue::compute_dense() {
 
 void SmallestSingularValue::compute_sparse() {
   factor_.compute(gram_);
+  // Where a pivot is exactly zero, a shift by rounding errors keeps the vector.
   if (factor_.singular()) gram_.diagonal().array() += rounding * mean_square_, factor_.compute(gram_);
   smallest_ = 1.0 / largest_eigenvalue_of_inverse();
   vector_is_computed_ = true;

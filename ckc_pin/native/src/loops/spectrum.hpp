@@ -6,7 +6,6 @@
 
 #include <Eigen/Cholesky>
 #include <Eigen/Eigenvalues>
-#include <Eigen/LU>
 
 #include "tree/linear.hpp"
 
@@ -24,9 +23,10 @@ class SmallestSingularValue {
   // `pattern`: nonzero columns by row. `rank`: number of singular values that are not zero at a regular state.
   SmallestSingularValue(std::vector<Indices> pattern, int columns, int rank);
 
-  // Scale rows and columns, then compute. Entries outside the pattern are ignored. `continues`: begin with the vector of
-  // the last call.
+  // Scale rows and columns, then compute. Entries outside the pattern are ignored. `continues`: begin with the last
+  // vector, if there is one.
   void compute(const Matrix& a, In row_scale, In column_scale, bool continues = false);
+  void forget_vector() { vector_is_computed_ = false; }
   double root_mean_square() const { return std::sqrt(mean_square_); }  // of the nonzero singular values
   double value() const { return std::sqrt(std::max(smallest_, 0.0)); }
   // Compute the singular vectors of the smallest singular value: u of unit length, and v = A^T u, whose length is
@@ -60,7 +60,6 @@ class SmallestSingularValue {
   Eigen::SelfAdjointEigenSolver<Small> ritz_;
   Factor factor_;
   Matrix shifted_;
-  Eigen::PartialPivLU<Matrix> shifted_lu_;
   Eigen::LLT<Matrix> shifted_cholesky_;
 };
 

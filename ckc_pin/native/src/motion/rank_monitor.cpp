@@ -19,7 +19,7 @@ RankMonitor::RankMonitor(const Core& core) : smallest_singular_value_(core.const
 
 double RankMonitor::value(Core& core) {
   core.compute_J();
-  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, continues_);
+  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, true);
   return smallest_singular_value_.value() / smallest_singular_value_.root_mean_square();
 }
 
@@ -27,9 +27,8 @@ RankMonitor::Rank RankMonitor::evaluate(System& system) {
   Core& core = system.core;
   if (core.rank == 0) return {};
   core.compute_J();
-  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, continues_);
+  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, true);
   smallest_singular_value_.compute_vectors(u_, v_);
-  continues_ = true;
   const double singular_value = v_.norm(), mean = smallest_singular_value_.root_mean_square();
   core.compute_J_dot(system.velocity);
   v_.array() *= core.scales.columns.array();

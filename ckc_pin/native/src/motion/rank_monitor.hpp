@@ -23,7 +23,7 @@ class RankMonitor {
     double value = 1.0, rate = 0.0;
   };
   Rank evaluate(System& system);  // at the core's state, moving with system.velocity
-  void reset() { continues_ = false; }  // before a run: forget the last one
+  void reset() { smallest_singular_value_.forget_vector(); }  // before a run: forget the last one
 
   static bool has_rank(const Rank& rank) { return rank.value >= rank_lost && std::isfinite(rank.rate); }
   // Whether a loss of rank of J may lie within the next steps.
@@ -55,7 +55,6 @@ class RankMonitor {
   double value(Core& core);
 
   Vector v_, u_;
-  bool continues_ = false;
   SmallestSingularValue smallest_singular_value_;  // of the scaled J
 };
 
