@@ -37,11 +37,12 @@ typedef long long int four_bits __attribute__((vector_size(32)));
 static const two two_ones={1.,1.};
 static const four four_ones={1.,1.,1.,1.};
 """
-# The whole library is not compiled for AVX-512, with which code on single numbers becomes slower.
 HEAD_OF_MEMBERS = """typedef double members __attribute__((vector_size(64)));
 typedef long long int members_bits __attribute__((vector_size(64)));
 static const members members_ones={1.,1.,1.,1.,1.,1.,1.,1.};
-#ifdef HAS_AVX512F
+"""
+# The whole library is not compiled for AVX-512, with which code on single numbers becomes slower.
+TARGET_OF_MEMBERS = """#ifdef HAS_AVX512F
 __attribute__((target("avx512f")))
 #endif
 """
@@ -78,8 +79,8 @@ def write_c_source(functions: Sequence[Any], lanes: LaneMap, of_members: Sequenc
         number stand one after the other, from an address that is a multiple of 64.
     """
     texts = [_FunctionWriter(function, lanes).write() for function in functions]
-    texts += [HEAD_OF_MEMBERS + _MembersWriter(function, {}).write() for function in of_members]
-    return HEAD + "".join(texts)
+    texts += [TARGET_OF_MEMBERS + _MembersWriter(function, {}).write() for function in of_members]
+    return HEAD + (HEAD_OF_MEMBERS if of_members else "") + "".join(texts)
 
 
 def write_static_function(function: Any, name: str) -> str:

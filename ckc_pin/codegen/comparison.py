@@ -74,21 +74,18 @@ class CompiledFunctions:
         getattr(self._library, name)(self._pointers(inputs), self._pointers(results), None, None, 0)
         return results
 
-    def accelerations(self, q: Array, v: Array, u: Array, numbers: Array) -> Array:
-        """Return `acceleration` of several members at a time, without correction; one column per member everywhere."""
-        name = "acceleration_of_members"
-        inputs = (
-            q,
-            np.vstack([np.cos(q), np.sin(q)]),
-            v,
-            u,
-            np.zeros((self.size(name, "in", 4) // MEMBERS, MEMBERS)),
-            numbers,
+    def call_of_members(self, name: str, q: Array, *arguments: Array, numbers: Array) -> list[Array]:
+        """Return a function's results for several members at a time; one column per member everywhere."""
+        name = f"{name}_of_members"
+        count = getattr(self._library, f"{name}_n_out")
+        count.restype = ctypes.c_longlong
+        zeros = [np.zeros((self.size(name, "out", k) // MEMBERS, MEMBERS)) for k in range(count())]
+        inputs, results = (
+            [_aligned(x) for x in arrays]
+            for arrays in ((q, np.vstack([np.cos(q), np.sin(q)]), *arguments, numbers), zeros)
         )
-        results = [np.zeros((self.size(name, "out", k) // MEMBERS, MEMBERS)) for k in range(2)]
-        arguments, results = ([_aligned(x) for x in arrays] for arrays in (inputs, results))
-        getattr(self._library, name)(self._pointers(arguments), self._pointers(results), None, None, 0)
-        return results[0]
+        getattr(self._library, name)(self._pointers(inputs), self._pointers(results), None, None, 0)
+        return results
 
     def size(self, name: str, side: str, k: int) -> int:
         """Return the number of entries of a function's k-th argument (`side` = "in") or result ("out")."""
@@ -274,18 +271,25 @@ def _compare_derivatives(mechanism: Mechanism, functions: CompiledFunctions, q: 
 def _compare_members(
     terms: Terms, functions: CompiledFunctions, parameters: Array, random: np.random.Generator
 ) -> None:
-    """Compare the accelerations of members, at neighbouring states and with other numbers, with one at a time."""
-    mechanism, no_correction = terms.mechanism, np.zeros(terms.mechanism.closure.rows)
-    q, v, u = (
+    """Compare functions of several members, at neighbouring states and with other numbers, with those of one."""
+    mechanism, rows = terms.mechanism, terms.mechanism.closure.rows
+    q, v, u, residual = (
         x[:, None] + random.uniform(-STATE_SPREAD, STATE_SPREAD, (len(x), MEMBERS))
-        for x in (terms.q_tree, terms.v_tree, np.zeros(mechanism.n))
+        for x in (terms.q_tree, terms.v_tree, np.zeros(mechanism.n), np.zeros(rows))
     )
     numbers = np.array([functions.numbers_of(parameters * random.uniform(0.9, 1.1)) for _ in range(MEMBERS)]).T
-    together = functions.accelerations(q, v, u, numbers)
-    for k in range(MEMBERS):
-        alone = functions.call("acceleration", q[:, k], v[:, k], u[:, k], no_correction, numbers=numbers[:, k])[0]
-        if not np.array_equal(together[:, k], alone, equal_nan=True):
-            raise InputError(f"{mechanism.name}: compiled accelerations of several members have other digits than one")
+    arguments = {
+        "acceleration": (v, u, np.zeros((rows, MEMBERS))), "place": (), "closing_step": (residual,), "inertia": (),
+        "potential_energy": (), "jacobian_rate": (v,),
+    }  # fmt: skip
+    for name, others in arguments.items():
+        if f"{name}_of_members" not in functions:
+            continue
+        together = functions.call_of_members(name, q, *others, numbers=numbers)
+        for k in range(MEMBERS):
+            alone = functions.call(name, q[:, k], *(x[:, k] for x in others), numbers=numbers[:, k])
+            if not all(np.array_equal(x[:, k], y, equal_nan=True) for x, y in zip(together, alone, strict=True)):
+                raise InputError(f"{mechanism.name}: compiled {name} of several members has other digits than of one")
 
 
 def _compare_directional_derivatives(

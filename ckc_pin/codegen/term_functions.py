@@ -31,6 +31,11 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
+# Also written for several members of an ensemble at a time: for the stages of a step, and in a mechanism of one planar
+# loop for its end.
+STAGE_OF_MEMBERS = ("acceleration",)
+ROWS_OF_ONE_LOOP = 2
+END_OF_MEMBERS = ("place", "closing_step", "inertia", "potential_energy", "jacobian_rate")
 # Of exported C. `bilinear` is the polarization of the terms that are quadratic in v': symmetric in v and x, and for
 # x = v equal to C' v' and J_dot v'. Projected by rho^T, it gives C x of eq. 6 for trees with and without a free root.
 PORTABLE_FUNCTIONS = {
@@ -57,7 +62,8 @@ class TermFunctions:
     - `FUNCTIONS` are the terms. `coriolis` is left out of a tree with a free root, whose twist has several C'.
       `jacobian` is left out where it would take too long to compile.
 
-    With `of_members`, the acceleration is also written for several members of an ensemble at a time.
+    With `of_members`, `STAGE_OF_MEMBERS` and `END_OF_MEMBERS` are also written for several members of an ensemble at a
+    time, the latter only for a mechanism whose loops have two rows.
 
     With `directional_derivatives`, there are also directional derivatives of the acceleration:
 
@@ -102,7 +108,7 @@ class TermFunctions:
         directional_derivatives : bool
             Whether to add directional derivatives.
         of_members : bool
-            Whether to add the acceleration of several members at a time.
+            Whether to add functions of several members at a time.
         portable : bool
             Whether to derive `PORTABLE_FUNCTIONS`, for code without vectors of identical branches; with
             `directional_derivatives` also `PORTABLE_DERIVATIVES`.
@@ -157,8 +163,10 @@ class TermFunctions:
 
     def c_source(self) -> str:
         """Return the C source of all functions."""
-        members = [self.functions["acceleration"]] if self.of_members else []
-        return write_c_source([*self.functions.values()], self.lanes, members)
+        names: tuple[str, ...] = STAGE_OF_MEMBERS if self.of_members else ()
+        if self.of_members and self.functions["place"].numel_out("phi") == ROWS_OF_ONE_LOOP:
+            names += END_OF_MEMBERS
+        return write_c_source([*self.functions.values()], self.lanes, [self.functions[name] for name in names])
 
 
 def _extract_numbers(

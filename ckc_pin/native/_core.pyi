@@ -814,6 +814,12 @@ class Batch:
         Members whose steps a thread computes together, in the processor's vector registers; 1 where the compiled terms or the controller do not allow it.
         """
 
+    @property
+    def end_count(self) -> int:
+        """
+        Ends of steps that were computed together, including those of rejected steps.
+        """
+
     def run(
         self,
         base: numpy.typing.NDArray[numpy.float64],

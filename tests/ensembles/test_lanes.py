@@ -29,9 +29,17 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]]]] = {
     "feedback": ("five_bar/set_point", {"formulation": "dae", "solver.method": "DOP853", "initial.at": None, **HANGING},
                  {"initial.q.theta_1": (-1.5, -1.3)}),
     "many steps": ("four_bar", {"t_end": 4.0}, {"initial.q_dot.crank": (3, 8)}),
+    "many turns": ("four_bar", {}, {"initial.q.crank": (627.0, 629.0)}),
+    "damping": ("five_bar/swing", {}, {"joint.theta_2.damping": (0.0, 0.1)}),
+    "slider": ("slider_crank",
+               {"formulation": "dae", "prescribed": None, "force": None, "work": None, "initial.at": None},
+               {"initial.q_dot.crank": (0, 20)}),
+    "crossings": ("n_four_bar", {"mechanism.N": 1, "t_end": 1.5}, {"initial.q_dot.theta_0": (-1.2, -0.8)}),
     "without projection": ("five_bar/swing", {"solver.projection": False}, {"initial.q.theta_1": (-1.9, -0.9)}),
 }  # fmt: skip
 
+# Whose ends of steps are computed together: one planar loop, no events, no controller, projection.
+WITH_ENDS = ("starts", "coarse", "exact", "RK45", "numbers", "many steps", "many turns", "damping", "slider")
 
 # Cases in which some members do not start, or stop before their end.
 IRREGULAR: dict[str, tuple[str, dict[str, Any], dict[str, tuple[float, float]]]] = {
@@ -73,6 +81,18 @@ def require_equal_digits(case: str) -> Chunk:
 @pytest.mark.parametrize("case", CASES)
 def test_digits_are_those_of_members_computed_alone(case: str) -> None:
     assert require_equal_digits(case).status.tolist() == [DONE] * MEMBERS
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_ends_of_steps_are_computed_together_where_nothing_else_happens_there(case: str) -> None:
+    members, values = prepare(case)
+    members.run(0, values)
+    stats = [ckc_pin.simulate(members.scene_of(x)).stats for x in values]
+    steps = sum(x["steps"] + x["rejected"] for x in stats)
+    if case in WITH_ENDS:
+        assert 0.9 * steps < members._batch.end_count <= 1.01 * steps
+    elif case != "crossings":
+        assert members._batch.end_count == 0
 
 
 @pytest.mark.parametrize(("case", "status"), [("not assembled", FAILED), ("out of budget", STOPPED)])

@@ -70,7 +70,7 @@ def test_native_core_leaks_nothing_when_python_exits():
     assert ended.stderr == ""
 
 
-@pytest.mark.parametrize("N", [3, 9, 30, 120])
+@pytest.mark.parametrize("N", [1, 3, 9, 30, 120])
 def test_monitored_singular_value_is_the_smallest_of_J(N):
     """Value and rate agree with NumPy, for chains whose J is decomposed as a dense matrix and for longer ones.
 

@@ -94,6 +94,12 @@ class Batch {
 
   // Members whose steps a thread computes together.
   size_t lanes() const { return teams_[0]->workers.size(); }
+  // Ends of steps that were computed together.
+  long end_count() const {
+    long count = 0;
+    for (const auto& team : teams_) count += team->lanes.end_count;
+    return count;
+  }
 
   void run(VectorArg base, Numbers q, Numbers q_dot, const nb::list& parameter_columns, VectorArg instants,
            const Indices& columns, double until, const nb::dict& out) {
@@ -283,6 +289,8 @@ void bind_batch(nb::module_& m) {
       .def_prop_ro("lanes", &Batch::lanes,
                    "Members whose steps a thread computes together, in the processor's vector registers; 1 where the "
                    "compiled terms or the controller do not allow it.")
+      .def_prop_ro("end_count", &Batch::end_count,
+                   "Ends of steps that were computed together, including those of rejected steps.")
       .def("run", &Batch::run, "base"_a, "q"_a, "q_dot"_a, nb::kw_only(), "parameters"_a, "instants"_a, "columns"_a,
            "until"_a, "out"_a,
            nb::sig("def run(self, base: numpy.typing.NDArray[numpy.float64], q: numpy.typing.NDArray[numpy.float64], "

@@ -21,6 +21,11 @@ CompiledTerms::CompiledTerms(const std::string& path, In parameters)
     coriolis_code_ = find_optional_code("coriolis", 5);
     potential_energy_code_ = find_code("potential_energy", 3), acceleration_code_ = find_code("acceleration", 6),
     accelerations_code_ = find_optional_code("acceleration_of_members", 6);
+    closures_code_ = find_optional_code("place_of_members", 3);
+    closure_steps_code_ = find_optional_code("closing_step_of_members", 4);
+    inertias_code_ = find_optional_code("inertia_of_members", 3);
+    potential_energies_code_ = find_optional_code("potential_energy_of_members", 3);
+    J_dots_code_ = find_optional_code("jacobian_rate_of_members", 4);
     closure_step_code_ = find_code("closing_step", 4), jacobian_code_ = find_optional_code("jacobian", 5);
     state_code_ = find_optional_code("state", 5), derivative_code_ = find_optional_code("change", 2),
     derivatives_code_ = find_optional_code("changes", 2);
@@ -181,6 +186,37 @@ void CompiledTerms::accelerations(const Members* q, const Members* trig, const M
   const double* from[] = {q->of, trig->of, v->of, u_tree->of, correction->of, constants->of};
   double* to[] = {acceleration->of, is_sound->of};
   accelerations_code_(from, to, nullptr, nullptr, 0);
+}
+
+void CompiledTerms::evaluate_closures(const MembersAt& at, Members* phi, Members* J) const {
+  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
+  double* to[] = {phi->of, J->of};
+  closures_code_(from, to, nullptr, nullptr, 0);
+}
+
+void CompiledTerms::evaluate_J_dots(const MembersAt& at, const Members* v, Members* J_dot) const {
+  const double* from[] = {at.q->of, at.trig->of, v->of, at.constants->of};
+  double* to[] = {J_dot->of};
+  J_dots_code_(from, to, nullptr, nullptr, 0);
+}
+
+void CompiledTerms::evaluate_D_trees(const MembersAt& at, Members* D_tree) const {
+  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
+  double* to[] = {D_tree->of};
+  inertias_code_(from, to, nullptr, nullptr, 0);
+}
+
+void CompiledTerms::evaluate_potential_energies(const MembersAt& at, Members* energy) const {
+  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
+  double* to[] = {energy->of};
+  potential_energies_code_(from, to, nullptr, nullptr, 0);
+}
+
+void CompiledTerms::closure_steps(const MembersAt& at, const Members* residual, Members* step,
+                                  Members* is_sound) const {
+  const double* from[] = {at.q->of, at.trig->of, residual->of, at.constants->of};
+  double* to[] = {step->of, is_sound->of};
+  closure_steps_code_(from, to, nullptr, nullptr, 0);
 }
 
 bool CompiledTerms::closure_step(In q, In residual, Out x) const {

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "tree/trig.hpp"
+#include "tree/widest_registers.hpp"
 
 namespace ckc {
 
@@ -46,6 +47,16 @@ class CompiledTerms {
   void accelerations(const Members* q, const Members* trig, const Members* v, const Members* u_tree,
                      const Members* correction, const Members* constants, Members* acceleration,
                      Members* is_sound) const;
+  // Other functions of several members, if the library has them. `trig`: cosines and sines of q.
+  struct MembersAt {
+    const Members *q, *trig, *constants;
+  };
+  bool has_ends() const { return closures_code_ && elimination_allowed_; }
+  void evaluate_closures(const MembersAt& at, Members* phi, Members* J) const;
+  void evaluate_J_dots(const MembersAt& at, const Members* v, Members* J_dot) const;
+  void evaluate_D_trees(const MembersAt& at, Members* D_tree) const;
+  void evaluate_potential_energies(const MembersAt& at, Members* energy) const;
+  void closure_steps(const MembersAt& at, const Members* residual, Members* step, Members* is_sound) const;
   const Vector& constants() const { return constants_; }
   // Directional derivatives of the acceleration, if the library has them, at the state of `prepare_derivatives`, which
   // returns false as above. A direction is (derivative of q', of v', `added`), where `added` are the derivatives of u'
@@ -95,7 +106,11 @@ class CompiledTerms {
   Code constants_code_, closure_code_, inertia_code_, bias_code_, J_dot_code_, h_tree_code_, coriolis_code_,
       potential_energy_code_, acceleration_code_, accelerations_code_, closure_step_code_, jacobian_code_;
   Code state_code_, derivative_code_, derivatives_code_, groups_code_;
+  Code closures_code_, closure_steps_code_, inertias_code_, potential_energies_code_, J_dots_code_;  // of members
   std::vector<Code> parameter_codes_;
 };
+
+inline Vector8& vector_of(CompiledTerms::Members& x) { return reinterpret_cast<Vector8&>(x); }
+inline const Vector8& vector_of(const CompiledTerms::Members& x) { return reinterpret_cast<const Vector8&>(x); }
 
 }  // namespace ckc

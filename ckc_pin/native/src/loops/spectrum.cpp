@@ -1,4 +1,5 @@
 #include "loops/spectrum.hpp"
+#include "loops/two_rows.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -92,11 +93,7 @@ bool SmallestSingularValue::continue_from_last_vector() {
 }
 
 void SmallestSingularValue::compute_dense() {
-  if (has_closed_form()) {
-    const double difference = 0.5 * (gram_(0, 0) - gram_(1, 1)), coupling = gram_(0, 1);
-    smallest_ = 0.5 * (gram_(0, 0) + gram_(1, 1)) - std::sqrt(difference * difference + coupling * coupling);
-    return;
-  }
+  if (has_closed_form()) return find_smallest_eigenvalue(gram_(0, 0), gram_(1, 1), gram_(0, 1), smallest_);
   eigen_.compute(gram_, Eigen::EigenvaluesOnly);
   smallest_ = eigen_.eigenvalues()(gram_.rows() - rank_);
 }
@@ -145,17 +142,7 @@ bool SmallestSingularValue::has_ended(int k) const {
 }
 
 void SmallestSingularValue::compute_vectors(Vector& u, Vector& v) {
-  if (has_closed_form()) {  // the longer of the two rows of gram - smallest, turned by a right angle
-    const double a = gram_(0, 0) - smallest_, b = gram_(1, 1) - smallest_, c = gram_(0, 1);
-    if (a > b)
-      u_ << -c, a;
-    else
-      u_ << b, -c;
-    if (a + b > 0.0)
-      u_.normalize();
-    else
-      u_ << 1.0, 0.0;
-  } else if (is_dense_ && !vector_is_computed_) {  // inverse iteration, shifted by the eigenvalue
+  if (is_dense_ && !vector_is_computed_) {  // inverse iteration, shifted by the eigenvalue
     gram_.diagonal().array() -= smallest_ + 1e-12 * mean_square_;
     factor_.compute(gram_);
     fill_generic_vector(u_);

@@ -6,9 +6,7 @@
 
 namespace ckc {
 
-constexpr int max_newton_steps = 10;
 constexpr double max_z_step_ratio = 4.0;   // of a step of z alone to a minimum-norm step: large near a singular phi_z
-constexpr double rounding = 2e-16;         // relative error of |J v'| that is not corrected
 constexpr double newton_tolerance = 1e-9;  // rad, or relative to the mechanism's size
 
 static double largest_entry(In x) { return x.size() ? x.lpNorm<Eigen::Infinity>() : 0.0; }
@@ -193,7 +191,7 @@ bool Dae::project_onto_manifold(In y) {
   }
   velocity = velocity_in(y);
   set_rate_residual(velocity);
-  if (largest_entry(residual_) <= rounding * core.constraints.J_norm() * velocity.norm()) return true;
+  if (largest_entry(residual_) <= rate_rounding * core.constraints.J_norm() * velocity.norm()) return true;
   if (!closure_step(residual_)) return false;
   velocity += step_;
   return velocity.allFinite();

@@ -8,6 +8,8 @@ namespace ckc {
 
 class Dae : public System {
  public:
+  static constexpr int max_newton_steps = 10;
+  static constexpr double rate_rounding = 2e-16;  // relative error of |J v'| that is not corrected
   // `alpha`, `beta`: parameters of Baumgarte's stabilization, zero without it.
   Dae(Core& core, Control& control, double tolerance, bool projects, double alpha, double beta);
 
@@ -21,6 +23,9 @@ class Dae : public System {
   bool set_core_configuration(In y) override;
   Accepted accept_motion(double t, Out y, double margin) override;
   void rate_pairs(std::vector<std::pair<int, int>>& of) const override;
+  double projection_tolerance() const override {
+    return projects_ && !control.is_active() && !elimination.is_due() ? tolerance_ : 0.0;
+  }
   bool conserves_energy() const override { return projects_ && !core.has_row_motion(); }
   bool reduce_to_freedoms(In y, Matrix& jacobian) override;
   const Vector& configuration_at_last_rhs() const override { return q_tree_; }

@@ -3,18 +3,21 @@
 
 #include <cmath>
 
-#include "motion/system.hpp"
+#include "motion/step_end.hpp"
 
 namespace ckc {
 
 class EnergyMonitor {
  public:
+  static constexpr double rounding = 1e-13;  // of the energy, relative to |kinetic| + |potential|
   explicit EnergyMonitor(const Core& core) { momentum_.setZero(core.n); }
   // Store the energy at the start of a step, at the core's state.
   void start_step(System& system);
-  // Energy change of a step to the core's state, relative to the change that errors within `rtol` and `atol` cause.
-  // Zero if the motion is not conservative.
-  double relative_change(System& system, double rtol, double atol);
+  // Whether a step to the core's state keeps the energy, up to a change that errors within `rtol` and `atol` cause.
+  // True if the motion is not conservative.
+  bool is_kept(System& system, double rtol, double atol);
+  // The same for a step to a state with this energy, if `allowance` shows it.
+  bool is_kept(const StepEnd& end);
   void accept_step() { start_energy_ = end_energy_; }
   double change = 0.0;  // J, of the last step
 

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "motion/method.hpp"
+#include "motion/step_end.hpp"
 
 namespace ckc {
 
@@ -13,6 +14,7 @@ class Explicit : public Method {
     Explicit* method = nullptr;
     double bound = 0.0;
     bool rate_is_known = false;
+    StepEnd* end = nullptr;  // to compute with it; null if the step loop has to do that
   };
   Explicit(Kind kind, System& system, Step& step, Work& work, const Tolerance& tolerance);
 

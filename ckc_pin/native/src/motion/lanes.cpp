@@ -3,8 +3,6 @@
 #include <algorithm>
 #include <cmath>
 
-#include "tree/widest_registers.hpp"
-
 namespace ckc {
 
 // With fewer members, computing each alone takes less time.
@@ -14,9 +12,6 @@ namespace {
 
 constexpr int width = Lanes::width;
 using Members = CompiledTerms::Members;
-
-Vector8& vector_of(Members& x) { return reinterpret_cast<Vector8&>(x); }
-const Vector8& vector_of(const Members& x) { return reinterpret_cast<const Vector8&>(x); }
 
 // sum = start + (coefficients[0] * factor) * rates[0] + ... of vectors of `size` numbers
 WITH_WIDEST_REGISTERS void add_products(const Members* start, const Members* const* rates, const double* coefficients,
@@ -107,6 +102,21 @@ void Lanes::compute(const Attempts& attempts, Explicit::Kind kind) {
     const Members* f_new = &rates_[stages * size_];
     for (int k = 0; k < size_; ++k) step.y_new(k) = y_[k].of[lane], step.f_new(k) = f_new[k].of[lane];
     of_lane.computed_ = {t_[lane], h_.of[lane], {squares[0].of[lane], squares[1].of[lane]}, &rates_[0].of[lane], width};
+  }
+  compute_ends(attempts);
+}
+
+void Lanes::compute_ends(const Attempts& attempts) {
+  int first = -1;
+  for (int lane = width - 1; lane >= 0; --lane)
+    if (methods_[lane] && attempts[lane].end) first = lane;
+  if (first < 0 || !terms_->has_ends()) return;
+  const System& system = methods_[first]->system_;
+  ends_.compute(system.core, system.projection_tolerance(), constants_.data(), y_.data(), trig_.data(), rtol_, atol_);
+  for (int lane = 0; lane < width; ++lane) {
+    if (!methods_[lane] || !attempts[lane].end || !ends_.read(lane, *attempts[lane].end)) continue;
+    attempts[lane].end->t = t_[lane], attempts[lane].end->t_new = t_[lane] + h_.of[lane];
+    ++end_count;
   }
 }
 

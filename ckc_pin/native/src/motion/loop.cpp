@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <utility>
 
 namespace ckc {
 
@@ -12,8 +13,6 @@ using Clock = std::chrono::steady_clock;
 constexpr double crossing_rtol = 1e-7;
 // Smallest step, relative to the remaining time, that is retried if its end or interior cannot be evaluated.
 constexpr double min_retry_fraction = 1e-9;
-// Energy change of a step of a conservative motion, relative to the tolerances, above which the step is wrong.
-constexpr double max_energy_change = 100.0;
 // Lower bounces are within the closure tolerance; rad, or relative to the mechanism's size.
 constexpr double min_bounce_rise = 1e-10;
 constexpr double infinity = std::numeric_limits<double>::infinity();
@@ -65,6 +64,7 @@ void StepLoop::start(double t, In q_tree, In v_tree, In w) {
   state_is_accepted_ = rate_is_known_ = cannot_repeat_ = false;
   waiting_step_.reset(), advances_unchanged_ = 0, is_paused_ = false;
   crossing_.reset(), monitor_.reset();
+  computed_end_.t = std::nan("");
   events.reset();
 }
 
@@ -259,17 +259,21 @@ std::optional<Stop> StepLoop::make_ordinary_step(double bound, bool last) {
   if (h < options_.min_step && now.t_new < bound) return Stop{Stop::min_step, now.t};
   const auto retry_with = [&](double part) { return method_->reject_step(part * h), std::nullopt; };
   const bool can_retry = h > min_retry_fraction * (bound - now.t);
-  if (!system->sync_core_at_last_rhs(now.t_new, now.y_new))
-    return can_retry ? retry_with(0.5) : std::optional(step_failure());
-  if (energy_.relative_change(*system, tolerance_.rtol, tolerance_.atol) > max_energy_change) {
-    if (can_retry) return retry_with(0.5);
-    return Stop{Stop::energy, now.t, energy_.change};
+  const bool end_is_computed = std::exchange(computed_end_.t, std::nan("")) == now.t &&
+                               computed_end_.t_new == now.t_new && energy_.is_kept(computed_end_);
+  CompletedStep step{method_, std::nan(""), computed_end_.rank, infinity, end_is_computed};
+  if (!end_is_computed) {
+    if (!system->sync_core_at_last_rhs(now.t_new, now.y_new))
+      return can_retry ? retry_with(0.5) : std::optional(step_failure());
+    if (!energy_.is_kept(*system, tolerance_.rtol, tolerance_.atol)) {
+      if (can_retry) return retry_with(0.5);
+      return Stop{Stop::energy, now.t, energy_.change};
+    }
+    events.end_step();
+    step.after = monitor_.evaluate(*system), step.margin = system->coordinate_margin();
   }
-  events.end_step();
-  const RankMonitor::Rank after = monitor_.evaluate(*system);
-  const double margin = system->coordinate_margin();
   if (system->core.rank) {
-    const Crossing::Verdict verdict = crossing_.judge_step(end_rank_, after);
+    const Crossing::Verdict verdict = crossing_.judge_step(end_rank_, step.after);
     if (control->failure.raised || work.budget_exhausted) return step_failure();
     if (verdict.rank_lost) {
       method_->interpolate(verdict.t, y_out_);
@@ -278,7 +282,7 @@ std::optional<Stop> StepLoop::make_ordinary_step(double bound, bool last) {
     }
     if (verdict.fraction < 1.0) return retry_with(verdict.fraction);
   }
-  return submit_step({method_, std::nan(""), after, margin}, bound, last);
+  return submit_step(step, bound, last);
 }
 
 std::optional<Stop> StepLoop::submit_step(const CompletedStep& step, double bound, bool last) {
@@ -318,6 +322,19 @@ std::optional<Stop> StepLoop::make_crossing_step(double crossed_at, double remai
   return submit_step({&motion, crossed_at, after, system->coordinate_margin()}, bound, last);
 }
 
+// Whether only what `StepEnd` contains is done at the ends of steps.
+bool StepLoop::can_take_computed_end() const {
+  return events.is_empty() && !integrand && !system->core.joints.has_events() && !may_step_beyond_ &&
+         RankMonitor::has_two_rows(system->core) && system->projection_tolerance() > 0.0;
+}
+
+Accepted StepLoop::accept_computed_end() {
+  now.y_new = computed_end_.y;
+  system->counts.newton += computed_end_.newton_steps, system->counts.factorizations += 2 * computed_end_.newton_steps;
+  system->elimination.accept_step(system->core);
+  return computed_end_.is_projected ? Accepted::changed : Accepted::unchanged;
+}
+
 Accepted StepLoop::accept_state(double t, Out y, double margin) {
   if (integrand) integrand->accept_step(y);
   return system->accept_step(t, y, margin);
@@ -348,7 +365,8 @@ std::optional<Stop> StepLoop::accept_step(const CompletedStep& step, bool last) 
       return Stop{Stop::event, now.t};
     }
   }
-  const Accepted accepted = accept_state(now.t_new, now.y_new, step.margin);
+  const Accepted accepted =
+      step.end_is_computed ? accept_computed_end() : accept_state(now.t_new, now.y_new, step.margin);
   method_->accept_step();
   crossing_.accept_step(step.after);
   end_rank_ = step.after, energy_.accept_step();

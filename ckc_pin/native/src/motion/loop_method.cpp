@@ -24,7 +24,8 @@ Explicit::Attempt StepLoop::prepare_explicit_step() {
   if (!method_ || method_ == radau_.get() || !(now.t < segment_end_)) return {};
   const bool is_prepared = joint_modes_known_ && state_is_accepted_;
   if (!is_prepared && prepare_step(segment_end_)) return {};
-  return {method_ == &dop853_ ? &dop853_ : &rk45_, segment_end_, rate_is_known_};
+  return {method_ == &dop853_ ? &dop853_ : &rk45_, segment_end_, rate_is_known_,
+          can_take_computed_end() ? &computed_end_ : nullptr};
 }
 
 // "auto" chooses the implicit method if damping or a controller makes the motion stiff.

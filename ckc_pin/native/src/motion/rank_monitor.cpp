@@ -1,4 +1,5 @@
 #include "motion/rank_monitor.hpp"
+#include "loops/two_rows.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -27,10 +28,16 @@ RankMonitor::Rank RankMonitor::evaluate(System& system) {
   Core& core = system.core;
   if (core.rank == 0) return {};
   core.compute_J();
+  core.compute_J_dot(system.velocity);
+  if (has_two_rows(core)) {
+    Rank rank;
+    find_rank_of_two_rows(core.constraints.J.data(), core.constraints.J_dot.data(), core.scales.rows.data(),
+                          core.scales.columns.data(), core.n, rank.value, rank.rate);
+    return rank;
+  }
   smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, true);
   smallest_singular_value_.compute_vectors(u_, v_);
   const double singular_value = v_.norm(), mean = smallest_singular_value_.root_mean_square();
-  core.compute_J_dot(system.velocity);
   v_.array() *= core.scales.columns.array();
   u_.array() *= core.scales.rows.array();
   double rate = 0.0;

@@ -23,6 +23,8 @@ class RankMonitor {
     double value = 1.0, rate = 0.0;
   };
   Rank evaluate(System& system);  // at the core's state, moving with system.velocity
+  // Whether J has two rows, for which there is a closed form (loops/two_rows.hpp).
+  static bool has_two_rows(const Core& core) { return core.rank == 2 && core.constraints.closure.rows == 2; }
   void reset() { smallest_singular_value_.forget_vector(); }  // before a run: forget the last one
 
   static bool has_rank(const Rank& rank) { return rank.value >= rank_lost && std::isfinite(rank.rate); }

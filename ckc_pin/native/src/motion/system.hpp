@@ -135,6 +135,9 @@ class System {
   virtual double coordinate_margin() { return std::numeric_limits<double>::infinity(); }
   double phi_z_margin();
   Accepted accept_step(double t, Out y, double margin) { return read_appended(y), accept_motion(t, y, margin); }
+  // Closure tolerance to which the next `accept_step` projects y = (q', v') by closing steps of the tree; zero if it does
+  // something else.
+  virtual double projection_tolerance() const { return 0.0; }
   // Return to the user's partition. False if its phi_z is singular.
   virtual bool restore_partition(double, Out, bool& changed) { return changed = false, true; }
   // Derivative of the coupled entries of y' with respect to those of y; that of the works is not computed and set to

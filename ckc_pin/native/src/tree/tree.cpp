@@ -255,12 +255,16 @@ void Tree::configuration_rate(In q, In v, Out q_dot) const {
 
 // As in `ckc_pin.mechanism.tree`.
 double Tree::tolerance_scale(In q, In units) const {
-  constexpr double large_coordinate = 100.0, max_factor = 1e4;
   double largest = 0.0;
   for (int k : single_dof) largest = std::max(largest, std::abs(q(q_index[k])) / units(k));
   for (const Root& root : roots)
     largest = std::max(largest, q.segment<3>(root.q).lpNorm<Eigen::Infinity>() / units(root.v));
-  return std::clamp(largest / large_coordinate, 1.0, max_factor);
+  return tolerance_factor(largest);
+}
+
+double Tree::tolerance_factor(double largest_coordinate) {
+  constexpr double large_coordinate = 100.0, max_factor = 1e4;
+  return std::clamp(largest_coordinate / large_coordinate, 1.0, max_factor);
 }
 
 Matrix Tree::q_dot_to_tangent(In q) const {

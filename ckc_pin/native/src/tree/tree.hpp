@@ -38,6 +38,8 @@ class Tree {
 
   // Factor (at least one) by which closure tolerances grow at q: large coordinates carry larger rounding errors.
   double tolerance_scale(In q, In units) const;
+  // The same from the largest coordinate of q, in its unit.
+  static double tolerance_factor(double largest_coordinate);
 
   // Compute the placements of all joints and the Jacobian, in world axes.
   void set_configuration(In q);

@@ -7,6 +7,8 @@
 #else
 #define WITH_WIDEST_REGISTERS
 #endif
+// Functions that are compiled as a part of those that call them.
+#define ALWAYS_INLINE __attribute__((always_inline)) inline
 
 namespace ckc {
 
