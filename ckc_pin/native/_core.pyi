@@ -723,6 +723,22 @@ class Predictor:
         w: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
     ) -> Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")]: ...
 
+class Factor:
+    """LU factorization of sparse square matrices, or QR of tall ones."""
+
+    def __init__(self, rows: int, columns: int, pattern: Sequence[Sequence[int]]) -> None: ...
+    def solve(
+        self,
+        a: Annotated[NDArray[numpy.float64], dict(shape=(None, None), writable=False)],
+        b: Annotated[NDArray[numpy.float64], dict(shape=(None,), writable=False)],
+    ) -> tuple[Annotated[NDArray[numpy.float64], dict(shape=(None,), order="C")], float]:
+        """
+        Factorize a matrix of this pattern; return the solution and the smallest pivot over the largest.
+        """
+
+    @property
+    def singular(self) -> bool: ...
+
 class SparseElimination:
     """Eliminates eq. 1 in sparse matrices, without pivoting."""
 

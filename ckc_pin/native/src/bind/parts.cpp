@@ -56,6 +56,25 @@ struct BoundPredictor {
   }
 };
 
+struct BoundFactor {
+  Factor factor;
+  int rows, columns;
+
+  BoundFactor(int rows, int columns, const std::vector<Indices>& pattern) : rows(rows), columns(columns) {
+    require(pattern.size() == static_cast<size_t>(rows), "pattern: its rows are needed");
+    for (const Indices& of_row : pattern) require_indices(of_row, columns, "pattern");
+    factor.set_pattern(rows, columns, pattern);
+  }
+  nb::typed<nb::tuple, Vector, double> solve(MatrixArg a, VectorArg b) {
+    require(a.rows() == rows && a.cols() == columns, "a: another size");
+    require(b, rows, "b");
+    Vector x(columns);
+    factor.compute(a);
+    factor.solve(b, x);
+    return nb::make_tuple(x, factor.pivot_ratio());
+  }
+};
+
 // Sparse elimination for a mechanism of any size, even if projection is cheaper.
 struct BoundSparseElimination {
   std::unique_ptr<Core> core;
@@ -198,6 +217,11 @@ void bind_parts(nb::module_& m, nb::class_<Loop>& binding) {
            "epsilon"_a)
       .def("add", &BoundPredictor::add, "t"_a, "q_tree"_a, "v_tree"_a, "w"_a)
       .def("predict", &BoundPredictor::predict, "t"_a, "numbers"_a, "w"_a);
+  nb::class_<BoundFactor>(m, "Factor", "LU factorization of sparse square matrices, or QR of tall ones.")
+      .def(nb::init<int, int, const std::vector<Indices>&>(), "rows"_a, "columns"_a, "pattern"_a)
+      .def("solve", &BoundFactor::solve, "a"_a, "b"_a,
+           "Factorize a matrix of this pattern; return the solution and the smallest pivot over the largest.")
+      .def_prop_ro("singular", [](const BoundFactor& bound) { return bound.factor.singular(); });
   nb::class_<BoundSparseElimination>(m, "SparseElimination", "Eliminates eq. 1 in sparse matrices, without pivoting.")
       .def(nb::init<const nb::typed<nb::dict, nb::str, nb::any>&>(), "core"_a)
       .def("acceleration", &BoundSparseElimination::acceleration, "q_tree"_a, "v_tree"_a, "u_tree"_a,

@@ -10,6 +10,8 @@ namespace ckc {
 
 // Smaller matrices are factorized densely: searching for the nonzero entries would cost more.
 constexpr int max_dense_rows = 6;
+// Space for the interval of a row, relative to the largest one so far.
+constexpr int fill_in_factor = 2;
 
 void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& pattern) {
   rows_ = rows, columns_ = columns, pattern_ = pattern, is_small_ = rows == columns && rows <= max_dense_rows;
@@ -22,8 +24,8 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
   for (int k = 0; k < columns; ++k) position_of_[column_at_[k]] = k;
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
-    lu_.setZero(rows, columns);
-    row_begin_.assign(rows, 0), row_end_.assign(rows, 0), row_at_.resize(rows), eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
+    row_begin_.assign(rows, 0), row_end_.assign(rows, 0), row_at_.resize(rows);
+    eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
     for (auto& eliminated : eliminated_rows_) eliminated.reserve(rows);
     active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
@@ -31,10 +33,32 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
       for (int j : pattern[i]) first_column = std::min(first_column, position_of_[j]);
       if (first_column < rows) rows_starting_at_[first_column].push_back(i), row_begin_[i] = row_end_[i] = first_column;
     }
+    values_.clear(), row_start_.assign(rows, 0), row_capacity_ = row_begin_;
+    for (int i = 0; i < rows; ++i) {
+      int end = is_small_ ? rows : row_begin_[i];
+      for (int j : pattern[i]) end = std::max(end, position_of_[j] + 1);
+      if (is_small_) row_begin_[i] = row_end_[i] = 0;
+      extend_row(i, end);
+    }
   } else {
     qr_.setZero(rows, columns);
     tau_.setZero(columns);
   }
+}
+
+// Make space for a longer interval of a row, by moving it behind all others.
+void Factor::extend_row(int i, int end) {
+  if (end <= row_capacity_[i]) return;
+  const int begin = row_begin_[i], capacity = std::min(columns_, begin + fill_in_factor * (end - begin));
+  const auto from = static_cast<size_t>(row_start_[i] + begin), to = values_.size();
+  values_.resize(to + static_cast<size_t>(capacity - begin), 0.0);
+  std::copy_n(values_.begin() + from, row_end_[i] - begin, values_.begin() + to);
+  row_start_[i] = static_cast<std::ptrdiff_t>(to) - begin, row_capacity_[i] = capacity;
+}
+
+double Factor::pivot(int k) const {
+  const int i = row_at_[k];
+  return k < row_capacity_[i] && k >= row_begin_[i] ? values_[static_cast<size_t>(row_start_[i] + k)] : 0.0;
 }
 
 void Factor::compute(const Matrix& a, const Indices& columns) {
@@ -46,16 +70,17 @@ void Factor::compute(const Matrix& a, const Indices& columns) {
   }
   if (is_small_) {
     for (int i = 0; i < rows_; ++i)
-      for (int k = 0; k < rows_; ++k) lu_(i, k) = a(i, at(column_at_[k]));
+      for (int k = 0; k < rows_; ++k) row(i)[k] = a(i, at(column_at_[k]));
     return eliminate_small();
   }
   for (int i = 0; i < rows_; ++i) {
     // Clear the fill-in of the previous factorization.
-    lu_.row(i).segment(row_begin_[i], row_end_[i] - row_begin_[i]).setZero();
+    double* const values = row(i);
+    std::fill(values + row_begin_[i], values + row_end_[i], 0.0);
     row_end_[i] = row_begin_[i];
     for (int j : pattern_[i]) {
       const int k = position_of_[j];
-      lu_(i, k) = a(i, at(j));
+      values[k] = a(i, at(j));
       row_end_[i] = std::max(row_end_[i], k + 1);
     }
   }
@@ -93,7 +118,8 @@ void Factor::eliminate() {
     size_t best = 0;
     double largest = -1.0;
     for (size_t i = 0; i < active_rows_.size(); ++i) {
-      const double size = std::abs(lu_(active_rows_[i], k));
+      const int candidate = active_rows_[i];
+      const double size = k < row_end_[candidate] ? std::abs(row(candidate)[k]) : 0.0;
       if (size > largest || std::isnan(size)) largest = size, best = i;
     }
     if (!(largest > 0.0)) singular_ = true;
@@ -105,14 +131,15 @@ void Factor::eliminate() {
     const int pivot = active_rows_[best], end = row_end_[pivot];
     active_rows_.erase(active_rows_.begin() + static_cast<std::ptrdiff_t>(best));
     row_at_[k] = pivot;
-    const double diagonal = lu_(pivot, k);
-    for (int row : active_rows_) {
-      if (lu_(row, k) == 0.0) continue;
-      const double factor = lu_(row, k) / diagonal;
-      lu_(row, k) = factor;
-      for (int j = k + 1; j < end; ++j) lu_(row, j) -= factor * lu_(pivot, j);
-      row_end_[row] = std::max(row_end_[row], end);
-      eliminated_rows_[k].push_back(row);
+    for (int i : active_rows_) {
+      if (k >= row_end_[i] || row(i)[k] == 0.0) continue;
+      extend_row(i, end);
+      double* const values = row(i);
+      const double* const pivot_values = row(pivot);
+      const double factor = values[k] /= pivot_values[k];
+      for (int j = k + 1; j < end; ++j) values[j] -= factor * pivot_values[j];
+      row_end_[i] = std::max(row_end_[i], end);
+      eliminated_rows_[k].push_back(i);
     }
   }
 }
@@ -124,25 +151,26 @@ void Factor::eliminate_small() {
     int best = k;
     double largest = -1.0;
     for (int i = k; i < n; ++i) {
-      const double size = std::abs(lu_(row_at_[i], k));
+      const double size = std::abs(row(row_at_[i])[k]);
       if (size > largest || std::isnan(size)) largest = size, best = i;
     }
     if (!(largest > 0.0)) singular_ = true;
     std::swap(row_at_[k], row_at_[best]);
-    const double* pivot = &lu_(row_at_[k], 0);
+    const double* const pivot = row(row_at_[k]);
     for (int i = k + 1; i < n; ++i) {
-      double* row = &lu_(row_at_[i], 0);
-      row[k] /= pivot[k];
-      for (int j = k + 1; j < n; ++j) row[j] -= row[k] * pivot[j];
+      double* const values = row(row_at_[i]);
+      values[k] /= pivot[k];
+      for (int j = k + 1; j < n; ++j) values[j] -= values[k] * pivot[j];
     }
   }
 }
 
 double Factor::pivot_ratio() const {
+  if (singular_) return 0.0;
   double smallest = std::numeric_limits<double>::infinity(), largest = 0.0;
   for (int k = 0; k < columns_; ++k) {
-    const double pivot = std::abs(rows_ == columns_ ? lu_(row_at_[k], k) : qr_(k, k));
-    smallest = std::min(smallest, pivot), largest = std::max(largest, pivot);
+    const double size = std::abs(rows_ == columns_ ? pivot(k) : qr_(k, k));
+    smallest = std::min(smallest, size), largest = std::max(largest, size);
   }
   return columns_ ? smallest / largest : 1.0;
 }
@@ -187,29 +215,30 @@ void Factor::solve(In b, Out x) {
   }
   if (is_small_) {
     for (int k = 0; k < rows_; ++k) {
-      const double* row = &lu_(row_at_[k], 0);
+      const double* const values = row(row_at_[k]);
       double value = b(row_at_[k]);
-      for (int j = 0; j < k; ++j) value -= row[j] * work_(j);
+      for (int j = 0; j < k; ++j) value -= values[j] * work_(j);
       work_(k) = value;
     }
     for (int k = rows_ - 1; k >= 0; --k) {
-      const double* row = &lu_(row_at_[k], 0);
+      const double* const values = row(row_at_[k]);
       double value = work_(k);
-      for (int j = k + 1; j < rows_; ++j) value -= row[j] * x(column_at_[j]);
-      x(column_at_[k]) = value / row[k];
+      for (int j = k + 1; j < rows_; ++j) value -= values[j] * x(column_at_[j]);
+      x(column_at_[k]) = value / values[k];
     }
     return;
   }
   work_.head(rows_) = b;
   for (int k = 0; k < rows_; ++k) {
     const double value = work_(row_at_[k]);
-    for (int row : eliminated_rows_[k]) work_(row) -= lu_(row, k) * value;
+    for (int i : eliminated_rows_[k]) work_(i) -= row(i)[k] * value;
   }
   for (int k = rows_ - 1; k >= 0; --k) {
-    const int row = row_at_[k];
-    double value = work_(row);
-    for (int j = k + 1; j < row_end_[row]; ++j) value -= lu_(row, j) * x(column_at_[j]);
-    x(column_at_[k]) = value / lu_(row, k);
+    const int i = row_at_[k];
+    const double* const values = row(i);
+    double value = work_(i);
+    for (int j = k + 1; j < row_end_[i]; ++j) value -= values[j] * x(column_at_[j]);
+    x(column_at_[k]) = value / pivot(k);
   }
 }
 

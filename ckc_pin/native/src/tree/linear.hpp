@@ -9,9 +9,9 @@ namespace ckc {
 
 // LU factorization with row pivoting of a square matrix, or QR factorization of a tall one, with solves.
 //
-// The constraint rows of one loop involve few columns. Each row therefore stores the interval of its nonzero entries,
-// and elimination works on these intervals. Columns are sorted by the first row that involves them. Independent loops
-// then cost as much as each one alone, and a chain of loops costs as much as a banded matrix.
+// The constraint rows of one loop involve few columns. Each row therefore stores the interval of its nonzero entries
+// only, and elimination works on these intervals. Columns are sorted by the first row that involves them. Independent
+// loops then cost as much as each one alone, and a chain of loops costs as much as a banded matrix.
 class Factor {
  public:
   // Set the size of the matrices and their sparsity pattern: by row, the columns that are not zero.
@@ -24,6 +24,9 @@ class Factor {
   double pivot_ratio() const;  // smallest pivot divided by the largest
 
  private:
+  double* row(int i) { return values_.data() + row_start_[i]; }  // of L U: its entry k in place k
+  double pivot(int k) const;                                    // zero if no row has an entry for it
+  void extend_row(int i, int end);
   void eliminate();
   void eliminate_small();
   void householder();
@@ -32,7 +35,9 @@ class Factor {
   std::vector<Indices> pattern_;
   Indices column_at_;    // column_at_[k]: column of the matrix that is eliminated as the k-th
   Indices position_of_;  // inverse of column_at_
-  Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor> lu_;
+  std::vector<double> values_;             // of L U; zero behind the interval of a row
+  std::vector<std::ptrdiff_t> row_start_;  // by row: where its entry 0 would be in values_
+  Indices row_capacity_;                   // by row: largest end of its interval for which there is space
   Matrix qr_;
   Vector tau_, work_;
   Indices row_begin_, row_end_;            // by row: its interval
