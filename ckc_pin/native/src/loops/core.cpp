@@ -43,6 +43,7 @@ Core::Core(CoreTable table)
   if (table.rotors.size()) tree.set_parameters(Tree::Parameter::rotors, table.rotors);
   size_t entries = 0;
   for (const Indices& rows : tree.inertia_pattern) entries += 2 * rows.size();
+  D_values_.reserve(entries / 2);
   D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
   choose_elimination();
 }
@@ -138,7 +139,7 @@ void Core::set_configuration(In q_tree_, bool with_inertia) {
   }
   const bool needs_D = with_inertia && !eliminates_by_bodies();
   if (needs_D)
-    tree.compute_D(q_tree);
+    tree.compute_D(q_tree), gather_D_tree();
   else
     tree.set_configuration(q_tree);
   valid_parts_ = (needs_D ? inertia_of_tree : 0u) | tree_is_set;
@@ -198,7 +199,15 @@ void Core::compute_D_tree() {
     compiled->evaluate_D_tree(q_tree, D_compiled_);
   } else
     tree.compute_D(q_tree);
+  gather_D_tree();
   valid_parts_ |= inertia_of_tree;
+}
+
+void Core::gather_D_tree() {
+  const Matrix& D = D_tree();
+  D_values_.clear();
+  for (int j = 0; j < n; ++j)
+    for (int i : tree.inertia_pattern[j]) D_values_.push_back(D(i, j));
 }
 
 void Core::compute_D() {
@@ -241,16 +250,20 @@ void Core::restrict_inertia(const Indices& independent, const Matrix& basis, Mat
 }
 
 void Core::multiply_D_tree(In x, Out product) const {
-  const Matrix& D = D_tree();
+  const double* value = D_values_.data();
   product.setZero();
   for (int j = 0; j < n; ++j) {
-    double sum = 0.0;
+    double sum = 0.0, diagonal = 0.0;
     for (int i : tree.inertia_pattern[j]) {
-      if (i == j) continue;
-      product(i) += D(i, j) * x(j);
-      sum += D(i, j) * x(i);
+      const double entry = *value++;
+      if (i == j) {
+        diagonal = entry;
+        continue;
+      }
+      product(i) += entry * x(j);
+      sum += entry * x(i);
     }
-    product(j) += sum + D(j, j) * x(j);
+    product(j) += sum + diagonal * x(j);
   }
 }
 

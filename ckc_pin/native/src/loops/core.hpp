@@ -249,6 +249,7 @@ class Core {
   void update_spring_lengths();
   void compute_spring_forces();                            // into elastic_
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
+  void gather_D_tree();
   void restrict_inertia(const Indices& independent, const Matrix& basis, Matrix& restricted);
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
@@ -282,6 +283,7 @@ class Core {
   long factors_configuration_ = -1, bodies_configuration_ = -1;
   unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
   Matrix C_tree_, D_compiled_, tangent_;
+  std::vector<double> D_values_;  // entries of D' in the order of tree.inertia_pattern, close together in memory
   Matrix D_basis_, dependent_basis_, D_dependent_, D_between_;  // of `restrict_inertia`
   Indices dependent_;
   Indices basis_coordinates_;           // by column of the tangent basis: its coordinate
