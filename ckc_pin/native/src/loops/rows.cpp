@@ -1,4 +1,5 @@
 #include "loops/rows.hpp"
+#include "tree/large_pages.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -49,8 +50,11 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
   wrenches_.resize(c.rows), pattern.resize(c.rows);
   log_jacobians_.assign(c.logs.size(), LogJacobian(Vector3::Zero()));
+  std::vector<Indices> joints_of_row(c.rows);
   const auto joints = [&](int out, std::initializer_list<int> list) {
-    for (int joint : list) wrenches_[out].push_back({joint, {}, Vector6::Zero(), Vector6::Zero()});
+    joints_of_row[out] = list;
+    for (int joint : list)
+      if (joint || wrenches_[out].size() < 2) wrenches_[out].push_back({joint, {}, Vector6::Zero(), Vector6::Zero()});
   };
   for (const auto& row : c.components)
     joints(row.out, {c.point_joint[row.pair], c.point_joint[pair_count_ + row.pair], c.direction_joint[row.direction]});
@@ -63,18 +67,17 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   for (const auto& rows : c.logs) used.insert(rows.joint_a), used.insert(rows.joint_b);
   used.erase(0);  // the world does not move
   joints_.assign(used.begin(), used.end());
-  phi.setZero(c.rows), J.setZero(c.rows, tree.n), J_dot.setZero(c.rows, tree.n);
+  phi.setZero(c.rows), set_zero(J, c.rows, tree.n), set_zero(J_dot, c.rows, tree.n);
   curve_values_.assign(c.curves.size(), Vector4::Zero()), curve_rates_.setZero(c.curves.size());
   for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
   for (int i = 0; i < c.rows; ++i) {
     std::set<int> columns;
     for (Wrench& wrench : wrenches_[i]) {
       for (int j : tree.support[wrench.joint]) {
-        const auto is_moved = [&](const Wrench& other) {
-          const Indices& support = tree.support[other.joint];
-          return std::binary_search(support.begin(), support.end(), j);
+        const auto is_moved = [&](int joint) {
+          return std::binary_search(tree.support[joint].begin(), tree.support[joint].end(), j);
         };
-        if (!std::all_of(wrenches_[i].begin(), wrenches_[i].end(), is_moved)) wrench.coordinates.push_back(j);
+        if (!std::all_of(joints_of_row[i].begin(), joints_of_row[i].end(), is_moved)) wrench.coordinates.push_back(j);
       }
       columns.insert(wrench.coordinates.begin(), wrench.coordinates.end());
     }
@@ -111,7 +114,7 @@ void ConstraintRows::update(const Tree& tree, In q) {
     phi(row.out) = e.dot(r);
     w[0].w = force(p_[row.pair], e);
     w[1].w = -force(p_[pair_count_ + row.pair], e);
-    if (w[2].joint) w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
+    if (w.size() > 2) w[2].w = torque(e.cross(r));  // e_dot . r = (omega x e) . r = omega . (e x r)
   }
   for (const auto& row : c.dots) {
     auto& w = wrenches_[row.out];
@@ -171,7 +174,7 @@ void ConstraintRows::update_rates(const Tree& tree, In v) {
     auto& w = wrenches_[row.out];
     w[0].w_dot = force_rate(p_[a], e, p_dot_[a], e_dot);
     w[1].w_dot = -force_rate(p_[b], e, p_dot_[b], e_dot);
-    if (w[2].joint) w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
+    if (w.size() > 2) w[2].w_dot = torque(e_dot.cross(r_[row.pair]) + e.cross(r_dot_[row.pair]));
   }
   for (const auto& row : c.dots) {
     auto& w = wrenches_[row.out];

@@ -12,6 +12,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "tree/large_pages.hpp"
 #include "tree/rotation.hpp"
 
 namespace ckc {
@@ -36,7 +37,7 @@ static pin::Data make_data(const pin::Model& model) {
                         &data.dFda})
     columns->setZero(6, n);
   for (auto* vector : {&data.tau, &data.nle, &data.g}) vector->setZero(n);
-  for (auto* matrix : {&data.M, &data.C}) matrix->setZero(n, n);
+  set_zero(data.M, n, n), set_zero(data.C, n, n);
   for (auto* matrix : {&data.dtau_dq, &data.dtau_dv}) matrix->setZero(n, n);
   data.Fcrb.assign(1, pin::Data::Matrix6x::Zero(6, n));  // the only one that is used
   data.mass.assign(joints, -1.0);
