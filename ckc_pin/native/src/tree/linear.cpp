@@ -12,6 +12,8 @@ namespace ckc {
 constexpr int max_dense_rows = 6;
 // Space for the interval of a row, relative to the largest one so far.
 constexpr int fill_in_factor = 2;
+// Space for rows that the elimination of a column changes, per column.
+constexpr int expected_eliminations = 4;
 
 void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& pattern) {
   rows_ = rows, columns_ = columns, pattern_ = pattern, is_small_ = rows == columns && rows <= max_dense_rows;
@@ -25,8 +27,8 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
     row_begin_.assign(rows, 0), row_end_.assign(rows, 0), row_at_.resize(rows);
-    eliminated_rows_.resize(rows), rows_starting_at_.assign(rows, {});
-    for (auto& eliminated : eliminated_rows_) eliminated.reserve(rows);
+    eliminated_end_.resize(rows), rows_starting_at_.assign(rows, {});
+    eliminated_rows_.reserve(expected_eliminations * rows);
     active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
       int first_column = rows;
@@ -112,7 +114,7 @@ std::vector<Indices> full_pattern(int size) {
 }
 
 void Factor::eliminate() {
-  active_rows_.clear();
+  active_rows_.clear(), eliminated_rows_.clear();
   for (int k = 0; k < rows_; ++k) {
     active_rows_.insert(active_rows_.end(), rows_starting_at_[k].begin(), rows_starting_at_[k].end());
     size_t best = 0;
@@ -123,9 +125,8 @@ void Factor::eliminate() {
       if (size > largest || std::isnan(size)) largest = size, best = i;
     }
     if (!(largest > 0.0)) singular_ = true;
-    eliminated_rows_[k].clear();
     if (active_rows_.empty()) {  // structurally singular
-      row_at_[k] = k;
+      row_at_[k] = k, eliminated_end_[k] = static_cast<int>(eliminated_rows_.size());
       continue;
     }
     const int pivot = active_rows_[best], end = row_end_[pivot];
@@ -139,8 +140,9 @@ void Factor::eliminate() {
       const double factor = values[k] /= pivot_values[k];
       for (int j = k + 1; j < end; ++j) values[j] -= factor * pivot_values[j];
       row_end_[i] = std::max(row_end_[i], end);
-      eliminated_rows_[k].push_back(i);
+      eliminated_rows_.push_back(i);
     }
+    eliminated_end_[k] = static_cast<int>(eliminated_rows_.size());
   }
 }
 
@@ -229,9 +231,9 @@ void Factor::solve(In b, Out x) {
     return;
   }
   work_.head(rows_) = b;
-  for (int k = 0; k < rows_; ++k) {
+  for (int k = 0, e = 0; k < rows_; ++k) {
     const double value = work_(row_at_[k]);
-    for (int i : eliminated_rows_[k]) work_(i) -= row(i)[k] * value;
+    for (; e < eliminated_end_[k]; ++e) work_(eliminated_rows_[e]) -= row(eliminated_rows_[e])[k] * value;
   }
   for (int k = rows_ - 1; k >= 0; --k) {
     const int i = row_at_[k];
