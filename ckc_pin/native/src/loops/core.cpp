@@ -34,7 +34,7 @@ Core::Core(CoreTable table)
   const int m = constraints.closure.rows;
   q_tree.setZero(tree.nq), v_tree.setZero(n), bias_tree.setZero(n), bias_without_springs_.setZero(n), h_tree.setZero(n),
       J_dot_v.setZero(m);
-  C_tree_.setZero(n, n), damping_tree.setZero(n);
+  damping_tree.setZero(n);
   x_.setZero(n), y_.setZero(n), elastic_.setZero(n), residual_.setZero(m), rho_dot_q_dot_.setZero(n);
   unbalanced_force_.setZero(n), lambda_.setZero(m), householder_rhs_.setZero(m), minus_residual_.setZero(m);
   tangent_.setZero(n, n - rank), basis_coordinates_.resize(n - rank);

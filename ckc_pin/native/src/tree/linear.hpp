@@ -43,7 +43,7 @@ class Factor {
   Indices row_begin_, row_end_;            // by row: its interval
   Indices row_at_;                         // rows in pivot order
   std::vector<Indices> rows_starting_at_;  // by column: rows whose interval begins there
-  Indices eliminated_rows_;                // rows that the elimination of each column changed, one column after the other
+  Indices eliminated_rows_;                // rows that the elimination of a column changed, one column after another
   Indices eliminated_end_;                 // by column: the end of its rows there
   Indices active_rows_;                    // rows that have started and are not yet pivots
   bool is_small_ = false, singular_ = false;

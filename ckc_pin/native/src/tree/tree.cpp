@@ -37,8 +37,7 @@ static pin::Data make_data(const pin::Model& model) {
                         &data.dFda})
     columns->setZero(6, n);
   for (auto* vector : {&data.tau, &data.nle, &data.g}) vector->setZero(n);
-  set_zero(data.M, n, n), set_zero(data.C, n, n);
-  for (auto* matrix : {&data.dtau_dq, &data.dtau_dv}) matrix->setZero(n, n);
+  set_zero(data.M, n, n);
   data.Fcrb.assign(1, pin::Data::Matrix6x::Zero(6, n));  // the only one that is used
   data.mass.assign(joints, -1.0);
   data.a_gf[0] = -model.gravity;
@@ -159,6 +158,7 @@ const Vector& Tree::compute_gravity(In q) {
 }
 
 const Matrix& Tree::compute_coriolis(In q, In v) {
+  if (!workspace_->data.C.size()) workspace_->data.C.setZero(n, n);
   return pin::computeCoriolisMatrix(workspace_->model, workspace_->data, q, v);
 }
 
@@ -173,6 +173,7 @@ double Tree::potential_energy(In q) { return pin::computePotentialEnergy(workspa
 void Tree::compute_derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
   pin::Model& model = workspace_->model;
   pin::Data& data = workspace_->data;
+  if (!data.dtau_dq.size()) data.dtau_dq.setZero(n, n), data.dtau_dv.setZero(n, n);
   pin::computeRNEADerivatives(model, data, q, v, a);
   by_q = data.dtau_dq, by_v = data.dtau_dv;
   if (gravity) return;  // placements, motions and Jacobian are those at this state
