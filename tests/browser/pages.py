@@ -16,8 +16,14 @@ from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
 __all__ = ["Tabs", "Visit", "browser", "look_at", "tabs"]
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "/Applications/Chromium.app/Contents/MacOS/Chromium")
-# WebGL without a GPU. Other parts of pages are drawn faster without it.
-SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-rasterization"]
+# WebGL without a GPU. Other parts of pages are drawn faster without it. Antialiasing takes a third of
+# the processor time of a frame, and no test looks at edges.
+SOFTWARE = [
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-rasterization",
+    "--webgl-antialiasing-mode=none",
+]
 SANDBOX = [] if os.getuid() else ["--no-sandbox"]  # Chromium's own does not run as root
 PATIENCE = 60.0  # s
 
