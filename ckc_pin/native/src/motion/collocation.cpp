@@ -24,18 +24,21 @@ constexpr double infinity = std::numeric_limits<double>::infinity();
 
 Collocation::Table::Table(int s)
     : nodes(gauss_nodes(s)),
-      at_nodes(legendre_values(nodes, s + 1)),
-      at_comparison_points(legendre_values(Vector::LinSpaced(comparison_points, -1.0, 1.0), s + 1)),
-      differentiation(legendre_derivative_matrix(s)) {
-  Matrix integral = Matrix::Zero(s, s + 1);  // of each polynomial
-  integral(0, 0) = integral(0, 1) = 1.0;
-  for (int k = 1; k < s; ++k) integral(k, k + 1) = 1.0 / (2 * k + 1), integral(k, k - 1) = -1.0 / (2 * k + 1);
-  integration = Matrix(legendre_values(nodes, s)).inverse() * integral;
+      at_nodes(legendre_values(nodes, s + 1).transpose()),
+      at_comparison_points(legendre_values(Vector::LinSpaced(comparison_points, -1.0, 1.0), s + 1).transpose()),
+      differentiation(legendre_derivative_matrix(s).transpose()) {
+  Matrix integral = Matrix::Zero(s + 1, s);  // of each polynomial
+  integral(0, 0) = integral(1, 0) = 1.0;
+  for (int k = 1; k < s; ++k) integral(k + 1, k) = 1.0 / (2 * k + 1), integral(k - 1, k) = -1.0 / (2 * k + 1);
+  integration = integral * Matrix(legendre_values(nodes, s).transpose()).inverse();
+  integration_at_nodes = at_nodes * integration;
 }
 
 Collocation::Collocation(System& system, Work& work, int few_stages, int many_stages)
-    : system_(system), work_(work), few_(few_stages), many_(many_stages) {
-  state_.setZero(system.size);
+    : system_(system), work_(work), few_(few_stages), many_(many_stages), is_integrated_twice_(system.size, false) {
+  state_.setZero(system.size), rate_.setZero(system.size);
+  system.rate_pairs(rate_pairs_);
+  for (const auto& pair : rate_pairs_) is_integrated_twice_[static_cast<size_t>(pair.first)] = true;
 }
 
 static double largest_entry(const Matrix& a) { return a.cwiseAbs().maxCoeff<Eigen::PropagateNaN>(); }
@@ -49,7 +52,7 @@ double Collocation::step_scale() const {
 void Collocation::evaluate(double t_, Out y) const {
   Vector x(1);
   x(0) = (2 * t_ - t_old - t) / (t - t_old);
-  y = series_ * legendre_values(x, series_.cols());
+  y = series_.transpose() * legendre_values(x, series_.rows());
 }
 
 void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
@@ -57,9 +60,8 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
                size = std::max(1.0, y.lpNorm<Eigen::Infinity>());
   t_old = t_, t = t_ + span, y_ = y;
   if (!is_repeat) {
-    Vector start(y.size());
-    if (!evaluate_rate(t_old, y_, start)) start.setConstant(std::nan(""));
-    guess_ = start.replicate(1, few_.nodes.size());
+    if (!evaluate_rate(t_old, y_, rate_)) rate_.setConstant(std::nan(""));
+    guess_ = rate_.transpose().replicate(few_.nodes.size(), 1);
     solve_stages(few_, length, guess_tolerance, infinity);
   }
   extrapolate_guess(few_, length, span / length);
@@ -72,7 +74,7 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
   extrapolate_guess(many_, span, 1.0);
   solve_stages(many_, span, step_tolerance, infinity);
   const double difference =
-      largest_entry(series_ * many_.at_comparison_points - few_stage_series_ * few_.at_comparison_points);
+      largest_entry(many_.at_comparison_points * series_ - few_.at_comparison_points * few_stage_series_);
   error = std::isfinite(difference) ? difference / size : infinity;
 }
 
@@ -80,26 +82,43 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
 // first sweep.
 double Collocation::solve_stages(const Table& table, double span, double tolerance, double max_first_change) {
   double guess_error = std::nan(""), previous_change = infinity;
+  const auto pairs = static_cast<Eigen::Index>(rate_pairs_.size());
+  rate_corrections_.setZero(table.nodes.size(), pairs);
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
     integrate(table, span);
-    if (!series_.allFinite()) break;
-    states_.noalias() = series_ * table.at_nodes;
+    if (!states_.allFinite()) break;
     evaluate_rates(table.nodes, span);
     const double sweep_change = largest_entry(rates_ - guess_) * span;
     if (sweep == 0) guess_error = sweep_change;
     guess_ = rates_;
+    for (Eigen::Index k = 0; k < pairs; ++k)
+      rate_corrections_.col(k) = rates_.col(rate_pairs_[k].first) - states_.col(rate_pairs_[k].second);
     // The iteration diverges, or has converged to rounding.
     if (!(sweep_change < 0.5 * previous_change) || guess_error > max_first_change) break;
     if (sweep_change * (sweep ? sweep_change / previous_change : 1.0) <= tolerance) break;
     previous_change = sweep_change;
   }
   integrate(table, span);
+  series_.noalias() = (0.5 * span) * table.integration * guess_;
+  series_.row(0) += y_.transpose();
   return guess_error;
 }
 
+// Integrate guess_ to the states at the stages. Coordinates are integrated from the velocities that the accelerations
+// give, which halves the number of sweeps.
 void Collocation::integrate(const Table& table, double span) {
-  series_.noalias() = (0.5 * span) * guess_ * table.integration;
-  series_.col(0) += y_;
+  states_.resizeLike(guess_);
+  const auto integrate_entry = [&](int i) {
+    states_.col(i) = (0.5 * span) * table.integration_at_nodes.lazyProduct(guess_.col(i));
+    states_.col(i).array() += y_(i);
+  };
+  for (int i = 0; i < system_.size; ++i)
+    if (!is_integrated_twice_[static_cast<size_t>(i)]) integrate_entry(i);
+  for (size_t k = 0; k < rate_pairs_.size(); ++k) {
+    const auto [i, j] = rate_pairs_[k];
+    guess_.col(i) = states_.col(j) + rate_corrections_.col(static_cast<Eigen::Index>(k));
+    integrate_entry(i);
+  }
 }
 
 bool Collocation::evaluate_rate(double t, In y, Out y_dot) {
@@ -110,18 +129,18 @@ bool Collocation::evaluate_rate(double t, In y, Out y_dot) {
 void Collocation::evaluate_rates(const Vector& nodes, double span) {
   rates_.resizeLike(guess_);
   for (Eigen::Index k = 0; k < nodes.size(); ++k) {
-    state_ = states_.col(k);
-    if (!evaluate_rate(t_old + span * (1 + nodes(k)) / 2, state_, rates_.col(k)))
-      rates_.col(k).setConstant(std::nan(""));
+    state_ = states_.row(k);
+    if (!evaluate_rate(t_old + span * (1 + nodes(k)) / 2, state_, rate_)) rate_.setConstant(std::nan(""));
+    rates_.row(k) = rate_;
   }
 }
 
 // Set guess_ to the rates of series_, extrapolated to a step that is `ratio` times as long.
 void Collocation::extrapolate_guess(const Table& table, double length, double ratio) {
-  const Table& table_of_series = series_.cols() == few_.nodes.size() + 1 ? few_ : many_;
+  const Table& table_of_series = series_.rows() == few_.nodes.size() + 1 ? few_ : many_;
   const Vector x = (1 + table.nodes.array()) * ratio - 1;
-  guess_ =
-      (2 / length) * (series_ * table_of_series.differentiation) * legendre_values(x, table_of_series.nodes.size());
+  guess_ = (2 / length) * legendre_values(x, table_of_series.nodes.size()).transpose() *
+           (table_of_series.differentiation * series_);
 }
 
 }  // namespace ckc

@@ -29,14 +29,14 @@ class Collocation : public Interpolant {
   double error = 0;  // difference between two steps with different stages, relative to |y|
 
  private:
-  // Matrices for one number of stages. Polynomials are Legendre series, one column per degree; the matrices multiply
-  // them from the right.
+  // Matrices for one number of stages. Polynomials are Legendre series, one row per degree and one column per entry of y.
   struct Table {
     explicit Table(int stages);
     Vector nodes;
     Matrix at_nodes;              // from a series to its values at the nodes
     Matrix at_comparison_points;  // from a series to its values where two steps are compared
     Matrix integration;           // from values at the nodes to the series of their integral
+    Matrix integration_at_nodes;  // from values at the nodes to those of their integral
     Matrix differentiation;       // from a series to the series of its derivative
   };
 
@@ -49,8 +49,11 @@ class Collocation : public Interpolant {
   System& system_;
   Work& work_;
   const Table few_, many_;
-  Vector y_, state_;
-  Matrix series_, few_stage_series_, guess_, states_, rates_;
+  std::vector<std::pair<int, int>> rate_pairs_;  // entries of y of which the second is the rate of the first
+  std::vector<bool> is_integrated_twice_;        // by entry of y: whether it is the first of a pair
+  Vector y_, state_, rate_;
+  Matrix series_, few_stage_series_, guess_, states_, rates_;  // the last three have one row per stage
+  Matrix rate_corrections_;  // by stage and pair: change of the rate by the projection
 };
 
 }  // namespace ckc
