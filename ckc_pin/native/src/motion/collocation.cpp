@@ -8,24 +8,22 @@
 
 namespace ckc {
 
-// Accepted difference between two steps with different numbers of stages, relative to |y|.
+// Accepted error of a polynomial of lower degree, and of the iteration, relative to |y|.
 constexpr double max_relative_error = 1e-9;
 constexpr int error_order = 12;  // observed order of the error in the step size
-// Tolerances of the fixed-point iteration on the stages: for the step itself, for the step that it is compared with,
-// and for the step from which the initial guess is extrapolated.
-constexpr double step_tolerance = 0.005 * max_relative_error, comparison_tolerance = 0.1 * max_relative_error,
-                 guess_tolerance = 1e-4;
+// Tolerances of the fixed-point iteration on the stages: for the step itself, and for the step from which the initial
+// guess is extrapolated.
+constexpr double step_tolerance = 0.005 * max_relative_error, guess_tolerance = 1e-4;
 constexpr int max_sweeps = 30;
 constexpr double run_up_fraction = 0.4;   // part of the step that is integrated first, as a guess for the rest
 constexpr double max_guess_error = 0.03;  // relative to |y|; with a larger error of the guess the step is rejected
 constexpr double predicted_error_factor = 1e-6;  // observed error of such a step, relative to the error of its guess
-constexpr int comparison_points = 41;
+constexpr int points_of_rest = 41;  // at which the terms of the highest degrees are evaluated
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 Collocation::Table::Table(int s)
     : nodes(gauss_nodes(s)),
       at_nodes(legendre_values(nodes, s + 1).transpose()),
-      at_comparison_points(legendre_values(Vector::LinSpaced(comparison_points, -1.0, 1.0), s + 1).transpose()),
       differentiation(legendre_derivative_matrix(s).transpose()) {
   Matrix integral = Matrix::Zero(s + 1, s);  // of each polynomial
   integral(0, 0) = integral(1, 0) = 1.0;
@@ -34,8 +32,10 @@ Collocation::Table::Table(int s)
   integration_at_nodes = at_nodes * integration;
 }
 
-Collocation::Collocation(System& system, Work& work, int few_stages, int many_stages)
-    : system_(system), work_(work), few_(few_stages), many_(many_stages), is_integrated_twice_(system.size, false) {
+Collocation::Collocation(System& system, Work& work, int stages, int run_up_stages)
+    : system_(system), work_(work), table_(stages), run_up_(run_up_stages), is_integrated_twice_(system.size, false) {
+  const Vector points = Vector::LinSpaced(points_of_rest, -1.0, 1.0);
+  rest_at_points_ = legendre_values(points, stages + 1).bottomRows(stages - run_up_stages).transpose();
   state_.setZero(system.size), rate_.setZero(system.size);
   system.rate_pairs(rate_pairs_);
   for (const auto& pair : rate_pairs_) is_integrated_twice_[static_cast<size_t>(pair.first)] = true;
@@ -61,27 +61,23 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
   t_old = t_, t = t_ + span, y_ = y;
   if (!is_repeat) {
     if (!evaluate_rate(t_old, y_, rate_)) rate_.setConstant(std::nan(""));
-    guess_ = rate_.transpose().replicate(few_.nodes.size(), 1);
-    solve_stages(few_, length, guess_tolerance, infinity);
+    guess_ = rate_.transpose().replicate(run_up_.nodes.size(), 1);
+    solve_stages(run_up_, length, guess_tolerance, infinity);
   }
-  extrapolate_guess(few_, length, span / length);
-  const double guess_error = solve_stages(few_, span, comparison_tolerance, max_guess_error * size);
+  extrapolate_guess(length, span / length);
+  const double guess_error = solve_stages(table_, span, step_tolerance, max_guess_error * size);
   if (!(guess_error <= max_guess_error * size)) {
     error = std::isfinite(guess_error) ? predicted_error_factor * guess_error / size : infinity;
     return;
   }
-  few_stage_series_ = series_;
-  extrapolate_guess(many_, span, 1.0);
-  solve_stages(many_, span, step_tolerance, infinity);
-  const double difference =
-      largest_entry(many_.at_comparison_points * series_ - few_.at_comparison_points * few_stage_series_);
-  error = std::isfinite(difference) ? difference / size : infinity;
+  const double rest = largest_entry(rest_at_points_ * series_.bottomRows(rest_at_points_.cols()));
+  error = std::isfinite(rest + iteration_error_) ? std::max(rest, iteration_error_) / size : infinity;
 }
 
 // Solve for the stages by fixed-point iteration from guess_; the solution is series_. Return the change of y in the
 // first sweep.
 double Collocation::solve_stages(const Table& table, double span, double tolerance, double max_first_change) {
-  double guess_error = std::nan(""), previous_change = infinity;
+  double guess_error = std::nan(""), previous_change = infinity, contraction = 1.0;
   const auto pairs = static_cast<Eigen::Index>(rate_pairs_.size());
   rate_corrections_.setZero(table.nodes.size(), pairs);
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
@@ -90,15 +86,18 @@ double Collocation::solve_stages(const Table& table, double span, double toleran
     evaluate_rates(table.nodes, span);
     const double sweep_change = largest_entry(rates_ - guess_) * span;
     if (sweep == 0) guess_error = sweep_change;
+    contraction = sweep ? sweep_change / previous_change : 1.0;
     guess_ = rates_;
     for (Eigen::Index k = 0; k < pairs; ++k)
       rate_corrections_.col(k) = rates_.col(rate_pairs_[k].first) - states_.col(rate_pairs_[k].second);
     // The iteration diverges, or has converged to rounding.
     if (!(sweep_change < 0.5 * previous_change) || guess_error > max_first_change) break;
-    if (sweep_change * (sweep ? sweep_change / previous_change : 1.0) <= tolerance) break;
+    if (sweep_change * contraction <= tolerance) break;
     previous_change = sweep_change;
   }
+  last_states_ = states_;
   integrate(table, span);
+  iteration_error_ = contraction * largest_entry(states_ - last_states_);
   series_.noalias() = (0.5 * span) * table.integration * guess_;
   series_.row(0) += y_.transpose();
   return guess_error;
@@ -136,9 +135,9 @@ void Collocation::evaluate_rates(const Vector& nodes, double span) {
 }
 
 // Set guess_ to the rates of series_, extrapolated to a step that is `ratio` times as long.
-void Collocation::extrapolate_guess(const Table& table, double length, double ratio) {
-  const Table& table_of_series = series_.rows() == few_.nodes.size() + 1 ? few_ : many_;
-  const Vector x = (1 + table.nodes.array()) * ratio - 1;
+void Collocation::extrapolate_guess(double length, double ratio) {
+  const Table& table_of_series = series_.rows() == run_up_.nodes.size() + 1 ? run_up_ : table_;
+  const Vector x = (1 + table_.nodes.array()) * ratio - 1;
   guess_ = (2 / length) * legendre_values(x, table_of_series.nodes.size()).transpose() *
            (table_of_series.differentiation * series_);
 }

@@ -11,8 +11,9 @@ namespace ckc {
 
 class Collocation : public Interpolant {
  public:
-  // Numbers of stages are even: an odd one has a stage in the middle, at the singular position.
-  Collocation(System& system, Work& work, int few_stages = 10, int many_stages = 14);
+  // Numbers of stages are even: an odd one has a stage in the middle, at the singular position. The step is accurate if
+  // a polynomial of degree `run_up_stages` would do.
+  Collocation(System& system, Work& work, int stages = 14, int run_up_stages = 10);
 
   // Step from (t, y) over a span whose middle is the singular position. `is_repeat`: the last step had the same start
   // and about the same span, so that it is the initial guess.
@@ -26,15 +27,14 @@ class Collocation : public Interpolant {
   double step_scale() const;
 
   double t_old = 0, t = 0;
-  double error = 0;  // difference between two steps with different stages, relative to |y|
+  double error = 0;  // of a polynomial of degree `run_up_stages`, and of the iteration, relative to |y|
 
  private:
-  // Matrices for one number of stages. Polynomials are Legendre series, one row per degree and one column per entry of y.
+  // Matrices for one number of stages. Polynomials are Legendre series, one row per degree, one column per entry of y.
   struct Table {
     explicit Table(int stages);
     Vector nodes;
     Matrix at_nodes;              // from a series to its values at the nodes
-    Matrix at_comparison_points;  // from a series to its values where two steps are compared
     Matrix integration;           // from values at the nodes to the series of their integral
     Matrix integration_at_nodes;  // from values at the nodes to those of their integral
     Matrix differentiation;       // from a series to the series of its derivative
@@ -43,16 +43,18 @@ class Collocation : public Interpolant {
   double solve_stages(const Table& table, double span, double tolerance, double max_first_change);
   void integrate(const Table& table, double span);
   void evaluate_rates(const Vector& nodes, double span);
-  void extrapolate_guess(const Table& table, double length, double ratio);
+  void extrapolate_guess(double length, double ratio);
   bool evaluate_rate(double t, In y, Out y_dot);
 
   System& system_;
   Work& work_;
-  const Table few_, many_;
+  const Table table_, run_up_;
+  Matrix rest_at_points_;  // from the terms of a series of degree more than `run_up_stages` to their sum at points
   std::vector<std::pair<int, int>> rate_pairs_;  // entries of y of which the second is the rate of the first
   std::vector<bool> is_integrated_twice_;        // by entry of y: whether it is the first of a pair
   Vector y_, state_, rate_;
-  Matrix series_, few_stage_series_, guess_, states_, rates_;  // the last three have one row per stage
+  double iteration_error_;  // expected change of y in the next sweep
+  Matrix series_, guess_, states_, last_states_, rates_;  // the last three have one row per stage
   Matrix rate_corrections_;  // by stage and pair: change of the rate by the projection
 };
 
