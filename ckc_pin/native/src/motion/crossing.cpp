@@ -12,6 +12,7 @@ namespace ckc {
 constexpr double max_time_past_end = 0.3, max_centre_error = 0.04, newton_time_tolerance = 0.01;
 // Singular value at an expected crossing, relative to the present one, above which it is no crossing.
 constexpr double max_remaining_singular_value = 0.1;
+constexpr double look_ahead_steps = 4.0;  // number of steps within which crossings are expected
 constexpr int max_attempts = 6, max_newton_steps = 10, manifold_checks = 9;
 // Bits of accuracy in the search for the smallest singular value, ahead of the step and within it.
 constexpr int ahead_search_bits = 8, step_search_bits = 24;
@@ -38,7 +39,11 @@ bool Crossing::may_pass() const { return collocation && attempts_ < max_attempts
 double Crossing::time_to_crossing(const Rank& end, double step_size, double t_bound) {
   const double t = step_.t, crossing = std::exchange(crossing_in_rejected_step_, not_found);
   if (std::isfinite(crossing)) return crossing - t;
-  if (!may_pass() || !RankMonitor::may_lose_rank_ahead(end, step_size)) return not_found;
+  // Steps may become short before the position, where rates are inexact. The last crossing tells from how far a
+  // crossing step succeeds.
+  const double last_distance = std::isfinite(max_distance_) ? max_distance_ : 0.0;
+  if (!may_pass() || !RankMonitor::may_lose_rank_within(end, std::max(look_ahead_steps * step_size, last_distance)))
+    return not_found;
   Core& core = system_.core;
   const int nq = core.tree.nq;
   const auto extrapolate = [&](double at) {  // with constant acceleration

@@ -11,7 +11,6 @@ namespace ckc {
 constexpr double max_valley_ratio = 0.7, max_minimum_ratio = 0.2;
 // Longest step that begins and ends with falling s, relative to the time to s = 0 along the tangent.
 constexpr double max_zero_time_ratio = 0.7;
-constexpr double look_ahead_steps = 4.0;    // number of steps within which crossings are expected
 constexpr double min_resolved_step = 1e-6;  // s; shorter steps resolve any gap between branches wider than `rank_lost`
 
 RankMonitor::RankMonitor(const Core& core) : smallest_singular_value_(core.constraints.pattern, core.n, core.rank) {
@@ -46,8 +45,8 @@ RankMonitor::Rank RankMonitor::evaluate(System& system) {
   return {singular_value / mean, rate / std::max(singular_value, 1e-300) / mean};
 }
 
-bool RankMonitor::may_lose_rank_ahead(const Rank& end, double length) {
-  return end.rate < 0.0 && end.value <= -look_ahead_steps * length * end.rate;
+bool RankMonitor::may_lose_rank_within(const Rank& end, double time) {
+  return end.rate < 0.0 && end.value <= -time * end.rate;
 }
 
 double RankMonitor::step_fraction(const Rank& before, const Rank& after, double h) {

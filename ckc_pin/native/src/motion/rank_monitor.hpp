@@ -28,8 +28,8 @@ class RankMonitor {
   void reset() { smallest_singular_value_.forget_vector(); }  // before a run: forget the last one
 
   static bool has_rank(const Rank& rank) { return rank.value >= rank_lost && std::isfinite(rank.rate); }
-  // Whether a loss of rank of J may lie within the next steps.
-  static bool may_lose_rank_ahead(const Rank& end, double length);
+  // Whether a loss of rank of J may lie within this time.
+  static bool may_lose_rank_within(const Rank& end, double time);
   // Fraction of a step of size h that can be accepted, given the values at its ends: 1 if it contains no loss of
   // rank, less if it is too long to tell, NaN if the interior must be searched.
   static double step_fraction(const Rank& before, const Rank& after, double h);
