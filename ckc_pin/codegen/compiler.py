@@ -58,9 +58,9 @@ def find_compiler(fuses: bool) -> Compiler | None:
     if path is None:
         return None
     flags = (*FLAGS, FUSED if fuses else EXACT, *_machine_flags(fuses))
-    real = Path(path).resolve()
-    stat = real.stat()
-    return Compiler(path, flags, hash_of((str(real), stat.st_size, stat.st_mtime_ns, flags))[:16])
+    real = os.path.realpath(path)
+    stat = os.stat(real)
+    return Compiler(path, flags, hash_of((real, stat.st_size, stat.st_mtime_ns, flags))[:16])
 
 
 @cache

@@ -118,7 +118,7 @@ def compile_terms(
     directional_derivatives : bool
         Whether to add directional derivatives of the acceleration, which takes longer to compile.
     of_members : bool
-        Whether to add the acceleration of several members of an ensemble at a time, which takes longer too.
+        Whether to add functions of several members of an ensemble at a time, which takes longer too.
     limited : bool
         Whether to refuse a tree that is too large. The compiler's only other limit is its timeout.
 
@@ -243,17 +243,43 @@ def _package_hash() -> str:
 def _look_up(subject: _Subject, folder: Path) -> Library | None:
     """Return the cached file of a key and of the present compiler, or of any compiler if there is none."""
     try:
-        paths = sorted(folder.glob(f"{subject.key}-*-*.so"))
-        if not paths or not _is_usable(folder):
+        if not _is_usable(folder):
             return None
         compiler = find_compiler(subject.directional_derivatives)
-        for path in paths:
-            _, compiler_key, content = path.stem.rsplit("-", 2)
-            is_of_compiler = compiler is None or compiler_key == compiler.key
-            if is_of_compiler and content == sha256(path.read_bytes()).hexdigest()[:32]:
-                return Library(str(path), subject.parameters)
+        asked = (str(folder), subject.key, None if compiler is None else compiler.key)
+        path, state = _intact.get(asked, (None, None))
+        if path is None or _state_of(path) != state:
+            path = _find_intact(*asked)
+            if path is None:
+                return None
+            _intact[asked] = path, _state_of(path)
+        return Library(path, subject.parameters)
     except OSError:
         return None
+
+
+# By folder, key and key of the compiler: a file whose content was intact, and its state then. Listing a folder of many
+# files takes longer than all the rest of looking up.
+_intact: dict[tuple[str, str, str | None], tuple[str, tuple[int, int, int] | None]] = {}
+
+
+def _state_of(path: str) -> tuple[int, int, int] | None:
+    try:
+        stat = os.stat(path)
+    except FileNotFoundError:
+        return None
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns
+
+
+def _find_intact(folder: str, key: str, compiler_key: str | None) -> str | None:
+    for name in sorted(os.listdir(folder)):
+        if not (name.startswith(f"{key}-") and name.endswith(".so")):
+            continue
+        _, compiler, content = name.removesuffix(".so").rsplit("-", 2)
+        path = os.path.join(folder, name)
+        is_of_compiler = compiler_key is None or compiler == compiler_key
+        if is_of_compiler and content == sha256(Path(path).read_bytes()).hexdigest()[:32]:
+            return path
     return None
 
 
