@@ -128,20 +128,18 @@ void LaneEnds::project(const CompiledTerms& terms, CompiledTerms::MembersAt at) 
   Members* v = &y_[n_];
   while (choose_members_to_move()) {
     terms.closure_steps(at, phi_.data(), step_.data(), &is_sound_);
-    multiply_J(J_.data(), step_.data(), n_, residual_.data());
-    find_largest(residual_.data(), nullptr, rows, largest_);
     add_step(step_.data(), is_chosen_, n_, y_.data());
     compute_cosines_and_sines_of_vectors(y_[0].of, n_ * width, trig_[0].of, trig_[n_].of);
     terms.evaluate_closures(at, phi_.data(), J_.data());
   }
-  Members J_square, v_square;
+  Members J_square, v_square, largest_rate;
   multiply_J(J_.data(), v, n_, residual_.data());
-  find_largest(residual_.data(), nullptr, rows, largest_);
+  find_largest(residual_.data(), nullptr, rows, largest_rate);
   find_square(J_.data(), rows * n_, J_square), find_square(v, n_, v_square);
   terms.closure_steps(at, residual_.data(), step_.data(), &is_sound_);
   for (int lane = 0; lane < width; ++lane) {
     const double size = std::sqrt(J_square.of[lane]) * std::sqrt(v_square.of[lane]);
-    const bool is_needed = is_projected_[lane] && largest_.of[lane] > Dae::rate_rounding * size;
+    const bool is_needed = is_projected_[lane] && largest_rate.of[lane] > Dae::rate_rounding * size;
     is_chosen_.of[lane] = is_needed;
     is_valid_[lane] = is_valid_[lane] && (!is_needed || is_sound_.of[lane] > 0.0);
   }
@@ -154,14 +152,11 @@ bool LaneEnds::choose_members_to_move() {
   find_largest(phi_.data(), nullptr, rows, largest_phi);
   bool any = false;
   for (int lane = 0; lane < width; ++lane) {
-    const double tolerance = closure_tolerance_.of[lane];
-    const bool has_moved = newton_steps_[lane] > 0, was_chosen = has_moved && is_chosen_.of[lane] > 0.0;
-    if (was_chosen && !(is_sound_.of[lane] > 0.0)) is_valid_[lane] = false;
-    // redundant rows that contradict each other keep phi large
-    const bool is_closed = !(largest_phi.of[lane] > tolerance) || (has_moved && !was_chosen) ||
-                           (was_chosen && largest_.of[lane] <= tolerance);
-    if (!is_closed && newton_steps_[lane] == Dae::max_newton_steps) is_valid_[lane] = false;
-    const bool moves = is_projected_[lane] && is_valid_[lane] && !is_closed;
+    const bool was_chosen = newton_steps_[lane] > 0 && is_chosen_.of[lane] > 0.0,
+               is_open = is_projected_[lane] && largest_phi.of[lane] > closure_tolerance_.of[lane];
+    if ((was_chosen && !(is_sound_.of[lane] > 0.0)) || (is_open && newton_steps_[lane] == Dae::max_newton_steps))
+      is_valid_[lane] = false;
+    const bool moves = is_open && is_valid_[lane];
     is_chosen_.of[lane] = moves, newton_steps_[lane] += moves;
     any = any || moves;
   }

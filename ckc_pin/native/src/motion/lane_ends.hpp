@@ -29,7 +29,7 @@ class LaneEnds {
   Members rank_value_, rank_rate_, energy_, energy_allowance_, closure_tolerance_;
   bool is_projected_[CompiledTerms::members], is_valid_[CompiledTerms::members];
   int newton_steps_[CompiledTerms::members];
-  Members is_chosen_, is_sound_, largest_;  // of a step; is_chosen_: 1 or 0
+  Members is_chosen_, is_sound_;  // of a step; is_chosen_: 1 or 0
   Lines phi_, J_, J_dot_, D_, momentum_, residual_, step_, trig_, y_;
 };
 
