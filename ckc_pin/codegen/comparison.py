@@ -64,26 +64,25 @@ class CompiledFunctions:
 
     def call(self, name: str, *arguments: Array, numbers: Array | None = None) -> list[Array]:
         """Return a function's results as vectors, matrices by columns."""
-        count = getattr(self._library, f"{name}_n_out")
-        count.restype = ctypes.c_longlong
-        results = [np.zeros(self.size(name, "out", k)) for k in range(count())]
-        inputs = [np.ascontiguousarray(x, dtype=float) for x in arguments]
+        inputs = list(arguments)
         if not name.startswith(("numbers", "change", "varied", "groups")):
             q, last = inputs[0], self._numbers if numbers is None else numbers
             inputs = [q, np.concatenate([np.cos(q), np.sin(q)]), *inputs[1:], last]
-        getattr(self._library, name)(self._pointers(inputs), self._pointers(results), None, None, 0)
-        return results
+        return self._run(name, inputs)
 
     def call_of_members(self, name: str, q: Array, *arguments: Array, numbers: Array) -> list[Array]:
-        """Return a function's results for several members at a time; one column per member everywhere."""
-        name = f"{name}_of_members"
+        """Return a function's results for `MEMBERS` members of an ensemble.
+
+        Each argument and result has one column per member. Its rows are the entries that `call` takes or returns.
+        """
+        inputs = [q, np.vstack([np.cos(q), np.sin(q)]), *arguments, numbers]
+        return [x.reshape(-1, MEMBERS) for x in self._run(f"{name}_of_members", inputs)]
+
+    def _run(self, name: str, arguments: list[Array]) -> list[Array]:
         count = getattr(self._library, f"{name}_n_out")
         count.restype = ctypes.c_longlong
-        zeros = [np.zeros((self.size(name, "out", k) // MEMBERS, MEMBERS)) for k in range(count())]
-        inputs, results = (
-            [_aligned(x) for x in arrays]
-            for arrays in ((q, np.vstack([np.cos(q), np.sin(q)]), *arguments, numbers), zeros)
-        )
+        inputs = [_aligned(np.asarray(x, dtype=float)) for x in arguments]
+        results = [_aligned(np.zeros(self.size(name, "out", k))) for k in range(count())]
         getattr(self._library, name)(self._pointers(inputs), self._pointers(results), None, None, 0)
         return results
 
@@ -271,7 +270,10 @@ def _compare_derivatives(mechanism: Mechanism, functions: CompiledFunctions, q: 
 def _compare_members(
     terms: Terms, functions: CompiledFunctions, parameters: Array, random: np.random.Generator
 ) -> None:
-    """Compare functions of several members, at neighbouring states and with other numbers, with those of one."""
+    """Compare the functions that compute several members in one call with those that compute one, digit by digit.
+
+    The members are at states near that of `terms`, each with parameters of its own.
+    """
     mechanism, rows = terms.mechanism, terms.mechanism.closure.rows
     q, v, u, residual = (
         x[:, None] + random.uniform(-STATE_SPREAD, STATE_SPREAD, (len(x), MEMBERS))

@@ -22,12 +22,12 @@ from ckc_pin.base.atomic_files import open_atomic, temporary_folder
 from ckc_pin.base.sources import Sources
 from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.compiler import Compiler, compile_c, find_compiler, hash_of
+from ckc_pin.codegen.structure import structure_key
 from ckc_pin.errors import InputError, MechanismError
 from ckc_pin.kinematics.loading import build
 from ckc_pin.mechanism.library import MECHANISM_FILE
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
-from ckc_pin.mechanism.rows import Curved, RelativeLog
 
 __all__ = [
     "Library",
@@ -37,7 +37,6 @@ __all__ = [
     "find_compiled_terms",
     "is_private",
     "process_folder",
-    "structure_key",
 ]
 
 COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, measured in docs/theory/generated.md
@@ -190,80 +189,32 @@ def _key(mechanism: Mechanism, which: Mapping[str, BoolArray], directional_deriv
     return hash_of((structure_key(mechanism, which), *kind))[:32]
 
 
-def structure_key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
-    """Return the hash of everything that enters expressions: this package, the tree, the rows, which numbers are zero.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    which : mapping
-        Numbers that are arguments (`arguments.present`).
-    """
-    tree, closure = mechanism.tree, mechanism.closure
-    model = tree.model
-    joints = [
-        (
-            parent,
-            joint.idx_q,
-            joint.idx_v,
-            placement.rotation.tolist(),
-            None if joint.nq == 7 else (tree.axis(k)[0].tolist(), bool(tree.axis(k)[1])),
-        )
-        for k, (parent, joint, placement) in enumerate(
-            zip(model.parents, model.joints, model.jointPlacements, strict=True)
-        )
-        if k > 0
-    ]
-    groups = [
-        (
-            type(group).__name__,
-            {name: np.asarray(x).tolist() for name, x in vars(group).items() if _is_constant(group, name)},
-        )
-        for group in closure.groups
-    ]
-    anchors = closure.anchors
-    table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
-    arguments = {name: x.tolist() for name, x in which.items()}
-    springs = mechanism.springs.anchors.point_joint.tolist()
-    return hash_of((_package_hash(), joints, groups, table, arguments, springs, mechanism.redundant))
-
-
-def _is_constant(group: object, name: str) -> bool:
-    """Return whether an attribute of a group of rows is written into the code as a constant."""
-    is_curve = isinstance(group, Curved) and name not in ("matrix", "offset")
-    return isinstance(group, RelativeLog) or is_curve or name in ("out", "pair", "direction", "a", "b")
-
-
-@cache
-def _package_hash() -> str:
-    folder = Path(__file__).parent
-    return hash_of([path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.py"))])
-
-
 def _look_up(subject: _Subject, folder: Path) -> Library | None:
     """Return the cached file of a key and of the present compiler, or of any compiler if there is none."""
     try:
         if not _is_usable(folder):
             return None
         compiler = find_compiler(subject.directional_derivatives)
-        asked = (str(folder), subject.key, None if compiler is None else compiler.key)
-        path, state = _intact.get(asked, (None, None))
-        if path is None or _state_of(path) != state:
-            path = _find_intact(*asked)
-            if path is None:
+        asked = str(folder), subject.key, None if compiler is None else compiler.key
+        path, state = _intact.get(asked, ("", None))
+        if state is None or _state_of(path) != state:
+            intact = _find_intact(*asked)
+            if intact is None:
                 return None
-            _intact[asked] = path, _state_of(path)
+            path, _ = _intact[asked] = intact
         return Library(path, subject.parameters)
     except OSError:
         return None
 
 
-# By folder, key and key of the compiler: a file whose content was intact, and its state then. Listing a folder of many
-# files takes longer than all the rest of looking up.
-_intact: dict[tuple[str, str, str | None], tuple[str, tuple[int, int, int] | None]] = {}
+FileState = tuple[int, int, int]  # inode, bytes, time of the last change: another one if the file was replaced
+# Libraries that this process has found, with the state in which their content was intact: by folder, key of the
+# mechanism and key of the compiler (None: there is no compiler). Listing a folder of many files takes longer than the
+# rest of a look-up.
+_intact: dict[tuple[str, str, str | None], tuple[str, FileState]] = {}
 
 
-def _state_of(path: str) -> tuple[int, int, int] | None:
+def _state_of(path: str) -> FileState | None:
     try:
         stat = os.stat(path)
     except FileNotFoundError:
@@ -271,15 +222,17 @@ def _state_of(path: str) -> tuple[int, int, int] | None:
     return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
-def _find_intact(folder: str, key: str, compiler_key: str | None) -> str | None:
+def _find_intact(folder: str, key: str, compiler_key: str | None) -> tuple[str, FileState] | None:
+    """Return a library whose content has the hash in its name, and the file's state."""
     for name in sorted(os.listdir(folder)):
         if not (name.startswith(f"{key}-") and name.endswith(".so")):
             continue
         _, compiler, content = name.removesuffix(".so").rsplit("-", 2)
         path = os.path.join(folder, name)
         is_of_compiler = compiler_key is None or compiler == compiler_key
-        if is_of_compiler and content == sha256(Path(path).read_bytes()).hexdigest()[:32]:
-            return path
+        state = _state_of(path)  # before the content is read
+        if state and is_of_compiler and content == sha256(Path(path).read_bytes()).hexdigest()[:32]:
+            return path, state
     return None
 
 

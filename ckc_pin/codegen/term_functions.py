@@ -31,11 +31,12 @@ FUNCTIONS = {
     "closing_step": (("q", "residual"), ("step", "sound")),
     "jacobian": (("q", "v", "u"), ("by_state", "by_u", "sound")),
 }
-# Also written for several members of an ensemble at a time: for the stages of a step, and in a mechanism of one planar
-# loop for its end.
+# Functions of which the library may have a second version that computes several members of an ensemble in one call:
+# those that an integration step evaluates at its stages, and those that it evaluates at its end. The core uses the
+# latter only if the closure has the two rows of one planar loop.
 STAGE_OF_MEMBERS = ("acceleration",)
-ROWS_OF_ONE_LOOP = 2
 END_OF_MEMBERS = ("place", "closing_step", "inertia", "potential_energy", "jacobian_rate")
+ROWS_OF_ONE_LOOP = 2
 # Of exported C. `bilinear` is the polarization of the terms that are quadratic in v': symmetric in v and x, and for
 # x = v equal to C' v' and J_dot v'. Projected by rho^T, it gives C x of eq. 6 for trees with and without a free root.
 PORTABLE_FUNCTIONS = {
@@ -62,8 +63,8 @@ class TermFunctions:
     - `FUNCTIONS` are the terms. `coriolis` is left out of a tree with a free root, whose twist has several C'.
       `jacobian` is left out where it would take too long to compile.
 
-    With `of_members`, `STAGE_OF_MEMBERS` and `END_OF_MEMBERS` are also written for several members of an ensemble at a
-    time, the latter only for a mechanism whose loops have two rows.
+    With `of_members`, the functions of `STAGE_OF_MEMBERS` are also written for several members of an ensemble at a
+    time, and for a closure of two rows those of `END_OF_MEMBERS`.
 
     With `directional_derivatives`, there are also directional derivatives of the acceleration:
 

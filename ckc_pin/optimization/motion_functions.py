@@ -15,7 +15,7 @@ from ckc_pin.base.arrays import Array
 from ckc_pin.codegen.arguments import present, values
 from ckc_pin.codegen.compiler import hash_of
 from ckc_pin.codegen.expressions import term_expressions
-from ckc_pin.codegen.library import structure_key
+from ckc_pin.codegen.structure import structure_key
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.mechanism.parameter_map import model_numbers
 from ckc_pin.optimization.many_instants import InstantsFunction
