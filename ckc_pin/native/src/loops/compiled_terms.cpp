@@ -7,6 +7,12 @@
 
 namespace ckc {
 
+// Call a function with its arguments and the places of its results.
+template <class Code, size_t arguments, size_t results>
+static void call(Code code, const double* (&&from)[arguments], double* (&&to)[results]) {
+  code(from, to, nullptr, nullptr, 0);
+}
+
 CompiledTerms::CompiledTerms(const std::string& path, In parameters)
     : library_(dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL)) {
   if (!library_) throw std::runtime_error(dlerror());
@@ -46,9 +52,7 @@ CompiledTerms::CompiledTerms(const std::string& path, In parameters)
 }
 
 void CompiledTerms::set_parameters(In parameters) {
-  const double* from[] = {parameters.data()};
-  double* to[] = {constants_.data()};
-  constants_code_(from, to, nullptr, nullptr, 0);
+  call(constants_code_, {parameters.data()}, {constants_.data()});
   q_.resize(0);
 }
 
@@ -75,46 +79,33 @@ long long CompiledTerms::row_count(const char* sparsity, long long k) const {
 }
 
 void CompiledTerms::evaluate_closure(In q, Out phi, Matrix& J) const {
-  const double* from[] = {q.data(), trig(q), constants_.data()};
-  double* to[] = {phi.data(), J.data()};
-  closure_code_(from, to, nullptr, nullptr, 0);
+  call(closure_code_, {q.data(), trig(q), constants_.data()}, {phi.data(), J.data()});
 }
 
 void CompiledTerms::evaluate_D_tree(In q, Matrix& D_tree) const {
-  const double* from[] = {q.data(), trig(q), constants_.data()};
-  double* to[] = {D_tree.data()};
-  inertia_code_(from, to, nullptr, nullptr, 0);
+  call(inertia_code_, {q.data(), trig(q), constants_.data()}, {D_tree.data()});
 }
 
 void CompiledTerms::evaluate_bias(In q, In v, Out bias_tree, Out J_dot_v, Out damping_tree) const {
-  const double* from[] = {q.data(), trig(q), v.data(), constants_.data()};
-  double* to[] = {bias_tree.data(), J_dot_v.data(), damping_tree.data()};
-  bias_code_(from, to, nullptr, nullptr, 0);
+  call(bias_code_, {q.data(), trig(q), v.data(), constants_.data()},
+       {bias_tree.data(), J_dot_v.data(), damping_tree.data()});
 }
 
 void CompiledTerms::evaluate_J_dot(In q, In v, Matrix& J_dot) const {
-  const double* from[] = {q.data(), trig(q), v.data(), constants_.data()};
-  double* to[] = {J_dot.data()};
-  J_dot_code_(from, to, nullptr, nullptr, 0);
+  call(J_dot_code_, {q.data(), trig(q), v.data(), constants_.data()}, {J_dot.data()});
 }
 
 void CompiledTerms::evaluate_h_tree(In q, Out h_tree) const {
-  const double* from[] = {q.data(), trig(q), constants_.data()};
-  double* to[] = {h_tree.data()};
-  h_tree_code_(from, to, nullptr, nullptr, 0);
+  call(h_tree_code_, {q.data(), trig(q), constants_.data()}, {h_tree.data()});
 }
 
 void CompiledTerms::multiply_C_tree(In q, In v, In x, Out product) const {
-  const double* from[] = {q.data(), trig(q), v.data(), x.data(), constants_.data()};
-  double* to[] = {product.data()};
-  coriolis_code_(from, to, nullptr, nullptr, 0);
+  call(coriolis_code_, {q.data(), trig(q), v.data(), x.data(), constants_.data()}, {product.data()});
 }
 
 double CompiledTerms::potential_energy(In q) const {
   double value = 0.0;
-  const double* from[] = {q.data(), trig(q), constants_.data()};
-  double* to[] = {&value};
-  potential_energy_code_(from, to, nullptr, nullptr, 0);
+  call(potential_energy_code_, {q.data(), trig(q), constants_.data()}, {&value});
   return value;
 }
 
@@ -131,29 +122,22 @@ bool CompiledTerms::prepare_derivatives(In q, In v, In u_tree) const {
 bool CompiledTerms::compute_state(In q, In v, In u_tree) const {
   q_ = q, v_ = v, u_ = u_tree;
   double is_sound = 0.0;
-  const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()};
-  double* to[] = {state_data_.data()->x, state_acceleration_.data(), &is_sound};
-  state_code_(from, to, nullptr, nullptr, 0);
+  call(state_code_, {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()},
+       {state_data_.data()->x, state_acceleration_.data(), &is_sound});
   return is_sound_ = is_sound > 0.0;
 }
 
 void CompiledTerms::directional_derivative(In direction, Out acceleration) const {
-  const double* from[] = {state_data_.data()->x, direction.data()};
-  double* to[] = {acceleration.data()};
-  derivative_code_(from, to, nullptr, nullptr, 0);
+  call(derivative_code_, {state_data_.data()->x, direction.data()}, {acceleration.data()});
 }
 
 void CompiledTerms::directional_derivatives(const Matrix& directions, Matrix& acceleration) const {
-  const double* from[] = {state_data_.data()->x, directions.data()};
-  double* to[] = {acceleration.data()};
-  derivatives_code_(from, to, nullptr, nullptr, 0);
+  call(derivatives_code_, {state_data_.data()->x, directions.data()}, {acceleration.data()});
 }
 
 Indices CompiledTerms::parameter_groups(In direction) const {
   Vector is_involved(parameter_codes_.size());
-  const double* from[] = {direction.data()};
-  double* to[] = {is_involved.data()};
-  groups_code_(from, to, nullptr, nullptr, 0);
+  call(groups_code_, {direction.data()}, {is_involved.data()});
   Indices groups;
   for (Eigen::Index k = 0; k < is_involved.size(); ++k)
     if (is_involved(k) != 0.0) groups.push_back(static_cast<int>(k));
@@ -161,9 +145,7 @@ Indices CompiledTerms::parameter_groups(In direction) const {
 }
 
 void CompiledTerms::parameter_direction(int group, In direction, Out added) const {
-  const double* from[] = {state_data_.data()->x, direction.data()};
-  double* to[] = {added.data()};
-  parameter_codes_[static_cast<size_t>(group)](from, to, nullptr, nullptr, 0);
+  call(parameter_codes_[static_cast<size_t>(group)], {state_data_.data()->x, direction.data()}, {added.data()});
 }
 
 bool CompiledTerms::eliminate(In q, In v, In u_tree, In correction, Out acceleration) const {
@@ -174,57 +156,43 @@ bool CompiledTerms::eliminate(In q, In v, In u_tree, In correction, Out accelera
     return true;
   }
   double is_sound = 0.0;
-  const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), correction.data(), constants_.data()};
-  double* to[] = {acceleration.data(), &is_sound};
-  acceleration_code_(from, to, nullptr, nullptr, 0);
+  call(acceleration_code_, {q.data(), trig(q), v.data(), u_tree.data(), correction.data(), constants_.data()},
+       {acceleration.data(), &is_sound});
   return is_sound > 0.0;
 }
 
 void CompiledTerms::accelerations(const Members* q, const Members* trig, const Members* v, const Members* u_tree,
                                   const Members* correction, const Members* constants, Members* acceleration,
                                   Members* is_sound) const {
-  const double* from[] = {q->of, trig->of, v->of, u_tree->of, correction->of, constants->of};
-  double* to[] = {acceleration->of, is_sound->of};
-  accelerations_code_(from, to, nullptr, nullptr, 0);
+  call(accelerations_code_, {q->of, trig->of, v->of, u_tree->of, correction->of, constants->of},
+       {acceleration->of, is_sound->of});
 }
 
 void CompiledTerms::evaluate_closures(const MembersAt& at, Members* phi, Members* J) const {
-  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
-  double* to[] = {phi->of, J->of};
-  closures_code_(from, to, nullptr, nullptr, 0);
+  call(closures_code_, {at.q->of, at.trig->of, at.constants->of}, {phi->of, J->of});
 }
 
 void CompiledTerms::evaluate_J_dots(const MembersAt& at, const Members* v, Members* J_dot) const {
-  const double* from[] = {at.q->of, at.trig->of, v->of, at.constants->of};
-  double* to[] = {J_dot->of};
-  J_dots_code_(from, to, nullptr, nullptr, 0);
+  call(J_dots_code_, {at.q->of, at.trig->of, v->of, at.constants->of}, {J_dot->of});
 }
 
 void CompiledTerms::evaluate_D_trees(const MembersAt& at, Members* D_tree) const {
-  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
-  double* to[] = {D_tree->of};
-  inertias_code_(from, to, nullptr, nullptr, 0);
+  call(inertias_code_, {at.q->of, at.trig->of, at.constants->of}, {D_tree->of});
 }
 
 void CompiledTerms::evaluate_potential_energies(const MembersAt& at, Members* energy) const {
-  const double* from[] = {at.q->of, at.trig->of, at.constants->of};
-  double* to[] = {energy->of};
-  potential_energies_code_(from, to, nullptr, nullptr, 0);
+  call(potential_energies_code_, {at.q->of, at.trig->of, at.constants->of}, {energy->of});
 }
 
 void CompiledTerms::closure_steps(const MembersAt& at, const Members* residual, Members* step,
                                   Members* is_sound) const {
-  const double* from[] = {at.q->of, at.trig->of, residual->of, at.constants->of};
-  double* to[] = {step->of, is_sound->of};
-  closure_steps_code_(from, to, nullptr, nullptr, 0);
+  call(closure_steps_code_, {at.q->of, at.trig->of, residual->of, at.constants->of}, {step->of, is_sound->of});
 }
 
 bool CompiledTerms::closure_step(In q, In residual, Out x) const {
   if (!elimination_allowed_) return false;
   double is_sound = 0.0;
-  const double* from[] = {q.data(), trig(q), residual.data(), constants_.data()};
-  double* to[] = {x.data(), &is_sound};
-  closure_step_code_(from, to, nullptr, nullptr, 0);
+  call(closure_step_code_, {q.data(), trig(q), residual.data(), constants_.data()}, {x.data(), &is_sound});
   return is_sound > 0.0;
 }
 
@@ -233,9 +201,8 @@ bool CompiledTerms::evaluate_jacobian(In q, In v, In u_tree, Matrix& by_state, M
   const auto state_size = q.size() + v.size();
   by_state.resize(state_size, state_size), by_u.resize(v.size(), v.size());
   double is_sound = 0.0;
-  const double* from[] = {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()};
-  double* to[] = {by_state.data(), by_u.data(), &is_sound};
-  jacobian_code_(from, to, nullptr, nullptr, 0);
+  call(jacobian_code_, {q.data(), trig(q), v.data(), u_tree.data(), constants_.data()},
+       {by_state.data(), by_u.data(), &is_sound});
   return is_sound > 0.0;
 }
 

@@ -50,6 +50,7 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   velocity_.resize(tree.joints, Vector6::Zero()), acceleration_.resize(tree.joints, Vector6::Zero());
   wrenches_.resize(c.rows), pattern.resize(c.rows);
   log_jacobians_.assign(c.logs.size(), LogJacobian(Vector3::Zero()));
+  // The first two wrenches of a row are those of its points or directions. Beyond them, the world needs none.
   std::vector<Indices> joints_of_row(c.rows);
   const auto joints = [&](int out, std::initializer_list<int> list) {
     joints_of_row[out] = list;

@@ -15,9 +15,9 @@ namespace ckc {
 // number.
 //
 // Small or rank-deficient matrices are decomposed densely, at a cost of rows cubed. For large ones, Lanczos' method
-// finds the largest eigenvalue of the inverse of A A^T, whose factors are as sparse as the loops. Along a motion, Rayleigh
-// quotient iteration from the last vector costs a quarter of both; a Cholesky factorization then shows that no other
-// eigenvalue is smaller.
+// finds the largest eigenvalue of the inverse of A A^T, whose factors are as sparse as the loops. Along a motion,
+// Rayleigh quotient iteration from the last vector costs a quarter of both; a Cholesky factorization then shows that no
+// other eigenvalue is smaller.
 class SmallestSingularValue {
  public:
   // `pattern`: nonzero columns by row. `rank`: number of singular values that are not zero at a regular state.

@@ -22,14 +22,12 @@ constexpr int points_of_rest = 41;  // at which the terms of the highest degrees
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
 Collocation::Table::Table(int s)
-    : nodes(gauss_nodes(s)),
-      at_nodes(legendre_values(nodes, s + 1).transpose()),
-      differentiation(legendre_derivative_matrix(s).transpose()) {
+    : nodes(gauss_nodes(s)), differentiation(legendre_derivative_matrix(s).transpose()) {
   Matrix integral = Matrix::Zero(s + 1, s);  // of each polynomial
   integral(0, 0) = integral(1, 0) = 1.0;
   for (int k = 1; k < s; ++k) integral(k + 1, k) = 1.0 / (2 * k + 1), integral(k - 1, k) = -1.0 / (2 * k + 1);
   integration = integral * Matrix(legendre_values(nodes, s).transpose()).inverse();
-  integration_at_nodes = at_nodes * integration;
+  integration_at_nodes = legendre_values(nodes, s + 1).transpose() * integration;
 }
 
 Collocation::Collocation(System& system, Work& work, int stages, int run_up_stages)

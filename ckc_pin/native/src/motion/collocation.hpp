@@ -34,7 +34,6 @@ class Collocation : public Interpolant {
   struct Table {
     explicit Table(int stages);
     Vector nodes;
-    Matrix at_nodes;              // from a series to its values at the nodes
     Matrix integration;           // from values at the nodes to the series of their integral
     Matrix integration_at_nodes;  // from values at the nodes to those of their integral
     Matrix differentiation;       // from a series to the series of its derivative

@@ -16,7 +16,7 @@ class EnergyMonitor {
   // Whether a step to the core's state keeps the energy, up to a change that errors within `rtol` and `atol` cause.
   // True if the motion is not conservative.
   bool is_kept(System& system, double rtol, double atol);
-  // The same for a step to a state with this energy, if `allowance` shows it.
+  // The same from the energy of `end`. False also if its allowance, the least one, does not decide.
   bool is_kept(const StepEnd& end);
   void accept_step() { start_energy_ = end_energy_; }
   double change = 0.0;  // J, of the last step

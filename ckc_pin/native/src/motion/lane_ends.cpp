@@ -37,14 +37,16 @@ WITH_WIDEST_REGISTERS void multiply_D(const Members* D, const std::vector<Indice
 WITH_WIDEST_REGISTERS void find_energies(const Members& kinetic, const Members& potential, const Members* momentum,
                                          const Members* v, int n, const Members& rtol, const Members& atol,
                                          Members& energy, Members& allowance) {
-  const Vector8 height = vector_of(potential), size = vector_of(kinetic) + (height < -height ? -height : height);
-  Vector8 sum = EnergyMonitor::rounding * size;
+  Vector8 height = vector_of(potential);
+  vector_of(energy) = vector_of(kinetic) + height;
+  make_absolute(height);
+  Vector8 sum = EnergyMonitor::rounding * (vector_of(kinetic) + height);
   for (int k = 0; k < n; ++k) {
     Vector8 p = vector_of(momentum[k]), rate = vector_of(v[k]);
-    p = p < -p ? -p : p, rate = rate < -rate ? -rate : rate;
+    make_absolute(p), make_absolute(rate);
     sum += p * (vector_of(atol) + vector_of(rtol) * rate);
   }
-  vector_of(energy) = vector_of(kinetic) + height, vector_of(allowance) = sum;
+  vector_of(allowance) = sum;
 }
 
 // Largest |x / unit|
@@ -52,7 +54,7 @@ WITH_WIDEST_REGISTERS void find_largest(const Members* x, const double* units, i
   Vector8 largest = {};
   for (int k = 0; k < size; ++k) {
     Vector8 value = vector_of(x[k]);
-    value = value < -value ? -value : value;
+    make_absolute(value);
     if (units) value /= units[k];
     largest = value > largest ? value : largest;
   }
@@ -146,7 +148,6 @@ void LaneEnds::project(const CompiledTerms& terms, CompiledTerms::MembersAt at) 
   add_step(step_.data(), is_chosen_, n_, v);
 }
 
-// Choose the members that need another step of Newton's method. False if there is none.
 bool LaneEnds::choose_members_to_move() {
   Members largest_phi;
   find_largest(phi_.data(), nullptr, rows, largest_phi);

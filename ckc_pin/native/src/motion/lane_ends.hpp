@@ -1,7 +1,9 @@
 // Ends of steps for several members of an ensemble at a time (Lanes): what the step loop monitors there, and the
 // projection onto the constraint manifold. For mechanisms of one planar loop, without a controller.
 //
-// The operations are those of `RankMonitor`, `EnergyMonitor` and `Dae::accept_step`, in the same order.
+// Projected states have the digits that `Dae::accept_motion` gives them: the operations are the same, in the same
+// order. Singular values and energies, which are only compared with bounds, agree with those of `RankMonitor` and
+// `EnergyMonitor` up to rounding.
 #pragma once
 
 #include "loops/compiled_terms.hpp"
@@ -23,7 +25,7 @@ class LaneEnds {
   void monitor(const Core& core, const CompiledTerms::MembersAt& at, const Members* v, const Members& rtol,
                const Members& atol);
   void project(const CompiledTerms& terms, CompiledTerms::MembersAt at);
-  bool choose_members_to_move();
+  bool choose_members_to_move();  // for a step of Newton's method; false if there is none
 
   int n_ = 0;
   Members rank_value_, rank_rate_, energy_, energy_allowance_, closure_tolerance_;

@@ -38,7 +38,7 @@ WITH_WIDEST_REGISTERS void add_squares(const Members* error, const Members* from
   Vector8 squares = {};
   for (int k = 0; k < size; ++k) {
     Vector8 a = vector_of(from[k]), b = vector_of(to[k]);
-    a = a < -a ? -a : a, b = b < -b ? -b : b;
+    make_absolute(a), make_absolute(b);
     const Vector8 ratio = vector_of(error[k]) / (vector_of(rtol) * (a < b ? b : a) + vector_of(atol));
     squares += ratio * ratio;
   }

@@ -1,9 +1,9 @@
 // Steps of an explicit method for several members of an ensemble at a time, each member in its own lane of the
-// processor's vector registers: the stages, and the ends where `LaneEnds` can. Everything else is each member's own, and
-// so is the size of its steps.
+// processor's vector registers: the stages, and the ends where `LaneEnds` can. Everything else is each member's own,
+// and so is the size of its steps.
 //
-// A member's results have the same digits as alone: the operations are those of `Explicit` and of the compiled terms, in
-// the same order.
+// A member's results have the same digits as alone: the operations are those of `Explicit` and of the compiled terms,
+// in the same order.
 #pragma once
 
 #include <array>

@@ -322,7 +322,6 @@ std::optional<Stop> StepLoop::make_crossing_step(double crossed_at, double remai
   return submit_step({&motion, crossed_at, after, system->coordinate_margin()}, bound, last);
 }
 
-// Whether only what `StepEnd` contains is done at the ends of steps.
 bool StepLoop::can_take_computed_end() const {
   return events.is_empty() && !integrand && !system->core.joints.has_events() && !may_step_beyond_ &&
          RankMonitor::has_two_rows(system->core) && system->projection_tolerance() > 0.0;

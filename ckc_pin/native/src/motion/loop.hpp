@@ -100,9 +100,9 @@ class StepLoop {
  private:
   struct CompletedStep {
     Interpolant* motion;
-    double crossed_at;        // s, time at which J lost rank; NaN for an ordinary step
-    RankMonitor::Rank after;  // at its end
-    double margin;            // `coordinate_margin` at its end
+    double crossed_at;             // s, time at which J lost rank; NaN for an ordinary step
+    RankMonitor::Rank after;       // at its end
+    double margin;                 // `coordinate_margin` at its end
     bool end_is_computed = false;  // whether `computed_end_` is its end
   };
   std::optional<Stop> prepare_step(double bound);
@@ -118,7 +118,7 @@ class StepLoop {
   Stop report_present(double until);  // inside the waiting step
   void start_state();                 // sets the state to `start_`
   Accepted accept_state(double t, Out y, double margin);
-  bool can_take_computed_end() const;
+  bool can_take_computed_end() const;  // whether the ends of steps need nothing that `StepEnd` does not contain
   Accepted accept_computed_end();
   void return_to_present();  // discards the waiting step
   std::optional<Stop> find_events(Interpolant& motion, bool last, double& stop_time);
@@ -145,7 +145,7 @@ class StepLoop {
   const Options options_;
   Tolerance tolerance_;
   Explicit dop853_, rk45_;
-  StepEnd computed_end_;
+  StepEnd computed_end_;  // of the next step, if Lanes has computed it
   std::unique_ptr<Radau> radau_;
   Method* method_ = nullptr;
   RankMonitor monitor_;

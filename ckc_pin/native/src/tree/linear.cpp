@@ -26,20 +26,18 @@ void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& patt
   for (int k = 0; k < columns; ++k) position_of_[column_at_[k]] = k;
   work_.setZero(std::max(rows, columns));
   if (rows == columns) {
-    row_begin_.assign(rows, 0), row_end_.assign(rows, 0), row_at_.resize(rows);
+    for (Indices* x : {&row_begin_, &row_end_, &row_capacity_, &row_at_}) x->assign(rows, 0);
+    values_.clear(), row_start_.assign(rows, 0);
     eliminated_end_.resize(rows), rows_starting_at_.assign(rows, {});
     eliminated_rows_.reserve(expected_eliminations * rows);
     active_rows_.reserve(rows);
     for (int i = 0; i < rows; ++i) {
-      int first_column = rows;
-      for (int j : pattern[i]) first_column = std::min(first_column, position_of_[j]);
-      if (first_column < rows) rows_starting_at_[first_column].push_back(i), row_begin_[i] = row_end_[i] = first_column;
-    }
-    values_.clear(), row_start_.assign(rows, 0), row_capacity_ = row_begin_;
-    for (int i = 0; i < rows; ++i) {
-      int end = is_small_ ? rows : row_begin_[i];
-      for (int j : pattern[i]) end = std::max(end, position_of_[j] + 1);
-      if (is_small_) row_begin_[i] = row_end_[i] = 0;
+      int begin = pattern[i].empty() ? 0 : rows, end = 0;
+      for (int j : pattern[i]) begin = std::min(begin, position_of_[j]), end = std::max(end, position_of_[j] + 1);
+      if (!pattern[i].empty()) rows_starting_at_[begin].push_back(i);
+      if (is_small_) begin = 0, end = rows;
+      row_begin_[i] = row_end_[i] = row_capacity_[i] = begin;
+      row_start_[i] = static_cast<std::ptrdiff_t>(values_.size()) - begin;
       extend_row(i, end);
     }
   } else {

@@ -15,4 +15,6 @@ namespace ckc {
 // Eight numbers as one vector. The compiler would vectorize loops over them along another loop, or not at all.
 typedef double Vector8 __attribute__((vector_size(8 * sizeof(double)), may_alias, aligned(sizeof(double))));
 
+ALWAYS_INLINE void make_absolute(Vector8& x) { x = x < -x ? -x : x; }
+
 }  // namespace ckc
