@@ -170,9 +170,16 @@ class BodyPose(Pose):
     def __init__(self, pose: Pose, anchors: Anchors) -> None:
         self.tree, self.anchors, self.q_tree = pose.tree, anchors, pose.q_tree
         self.rotation, self.translation = pose.rotation, pose.translation
-        bodies = len(pose.translation)
-        self.linear_part = np.tile(np.eye(3, 6), bodies)
-        self.angular_part = np.tile(np.eye(3, 6, 3), bodies)
+
+    @lazy
+    def linear_part(self) -> Array:
+        """Linear velocities at the world's origin of all bodies, shape (3, 6 joints)."""
+        return np.tile(np.eye(3, 6), len(self.translation))
+
+    @lazy
+    def angular_part(self) -> Array:
+        """Angular velocities of all bodies, shape (3, 6 joints)."""
+        return np.tile(np.eye(3, 6, 3), len(self.translation))
 
     @lazy
     def support(self) -> Array:
@@ -195,6 +202,12 @@ class BodyPose(Pose):
         wrenches = np.zeros((len(direction), len(self.translation), 6))
         wrenches[np.arange(len(direction)), self.anchors.direction_joint[direction], 3:] = torque
         return wrenches.reshape(len(direction), -1)
+
+    def angular(self, joint: IntArray) -> Array:
+        """Angular Jacobians of bodies, shape (k, 3, 6 joints)."""
+        jacobians = np.zeros((len(joint), 3, len(self.translation), 6))
+        jacobians[np.arange(len(joint)), :, joint, 3:] = np.eye(3)
+        return jacobians.reshape(len(joint), 3, -1)
 
 
 class Rate:

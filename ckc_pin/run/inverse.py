@@ -233,13 +233,14 @@ def _append_forces(
     missing = _multiply(transposed, required - u_tree)
     tolerance = FORCE_TOLERANCE * _multiply(np.abs(transposed), np.abs(required) + np.abs(u_tree))
     tolerance += CROSS_TOLERANCE * tolerance.max(axis=1, initial=0.0, keepdims=True)
+    needs_motors = np.isfinite(required).all(axis=1) & has_rank & (np.abs(missing) > tolerance).any(axis=1)
+    fails = ~np.isfinite(required).all(axis=1) | ~has_rank
+    fails[needs_motors] = _motor_motions(mechanism, tangent[needs_motors])[0][:, 0] <= DEAD_CENTRE_TOLERANCE**2
     error: NumericalError | None = None
-    is_determined = np.isfinite(required).all(axis=1) & has_rank & (np.abs(missing) <= tolerance).all(axis=1)
-    for k in np.flatnonzero(~is_determined).tolist():
-        error = _explain_missing_force(batch[k], mechanism, required[k], tangent[k] if has_rank[k] else None)
-        if error:
-            batch, states, acceleration = batch[:k], states[:k], acceleration[:k]
-            break
+    if fails.any():
+        k = int(np.argmax(fails))
+        error = _explain_failure(batch[k], mechanism, required[k], tangent[k] if has_rank[k] else None)
+        batch, states, acceleration = batch[:k], states[:k], acceleration[:k]
     m = len(batch)
     if m:
         tau = preload[:m] + actuation.minimum_norm_torques(tangent[:m], missing[:m])
@@ -265,26 +266,30 @@ def _multiply(matrices: Array, vectors: Array) -> Array:
     return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
-def _explain_missing_force(
-    instant: _Instant, mechanism: Mechanism, required: Array, tangent: Array | None
-) -> NumericalError | None:
-    """Return why motors cannot provide a required force (n,), or None if they can.
+def _motor_motions(mechanism: Mechanism, tangent: Array) -> tuple[Array, Array]:
+    """Return squares of motor motions by unit motions along principal directions, (..., d), and these (..., n, d).
 
-    A motion may not be finite, J may have lost rank (`tangent` is None), or no motor moves some freedom, for example at
-    a rocker's dead centre.
+    `tangent` are bases (..., n, d). Lengths are relative to the mechanism's size.
+    """
+    motions, _ = np.linalg.qr(tangent / mechanism.tree.step_scale[:, None])
+    motor_motions = mechanism.motors.transmission @ motions
+    values, directions = np.linalg.eigh(np.swapaxes(motor_motions, -1, -2) @ motor_motions)
+    return values, motions @ directions
+
+
+def _explain_failure(instant: _Instant, mechanism: Mechanism, required: Array, tangent: Array | None) -> NumericalError:
+    """Return why motors cannot provide a required force (n,).
+
+    The motion is not finite, J has lost rank (`tangent` is None), or no motor moves some freedom, for example at a
+    rocker's dead centre.
     """
     t = instant.t
     if not np.all(np.isfinite(required)):
         return NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
     if tangent is None:
         return rank_loss_error(instant.terms)
-    # Orthonormal motions, where lengths are relative to the mechanism's size.
-    motions, _ = np.linalg.qr(tangent / mechanism.tree.step_scale[:, None])
-    motor_motions = mechanism.motors.transmission @ motions
-    values, directions = np.linalg.eigh(motor_motions.T @ motor_motions)
-    if values[0] > DEAD_CENTRE_TOLERANCE**2:
-        return None
-    coordinate = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
+    _, directions = _motor_motions(mechanism, tangent)
+    coordinate = mechanism.coordinates[int(np.argmax(np.abs(directions[:, 0])))]
     return NumericalError(f"the motion along {coordinate} is held by no actuator at t = {t:.6g} s", t=t)
 
 
