@@ -16,12 +16,23 @@ from typing import Any
 import eigenpy
 import numpy as np
 
-from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.base.sparse import determinant, is_large_and_sparse, sparse_lu
 
-__all__ = ["Factorization", "null_space", "one_blas_thread", "pivoted_columns", "remove_direction"]
+__all__ = [
+    "MIN_PIVOT",
+    "Factorization",
+    "null_space",
+    "null_spaces",
+    "one_blas_thread",
+    "pivoted_columns",
+    "remove_direction",
+]
 
 TIE_TOLERANCE = 1e-8  # relative: of pivots closer than this the first is taken, since rounding differs by machine
+MIN_PIVOT = 1e-12  # of the largest pivot of a Jacobian: below it the Jacobian has lost rank
+SHARED_PIVOT_RATIO = 0.1  # of the smallest pivot of the matrix whose choice of columns other matrices share
+MAX_SHARED_ENTRY = 2.0  # of a basis of a null space; with a choice of its own hardly an entry is larger than 1
 MIN_SPARSE_SIZE = 20_000  # entries of a matrix whose zeros are worth skipping
 SCIPY = "scipy.linalg"  # comes with a BLAS library of its own
 
@@ -184,6 +195,12 @@ def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Arra
     pivots : (rank,) array
         Absolute values of the diagonal of R, decreasing.
     """
+    tangent, particular, pivots, _ = _null_space(jacobian, rank, residual)
+    return tangent, particular, pivots
+
+
+def _null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, Array, IntArray]:
+    """Return what `null_space` returns, and the columns (rank,) that the pivoting chose."""
     n = jacobian.shape[1]
     tangent, particular = np.zeros((n, n - rank)), np.zeros((n, *residual.shape[1:]))
     order, pivots = pivoted_columns(jacobian)
@@ -193,7 +210,46 @@ def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Arra
         basis = Factorization(jacobian[:, order])
         tangent[order] = -basis.solve(jacobian[:, remaining])
         particular[order] = -basis.solve(residual)
-    return tangent, particular, pivots
+    return tangent, particular, pivots, order
+
+
+def null_spaces(jacobians: Array, rank: int) -> tuple[Array, BoolArray]:
+    """Return bases of the null spaces of Jacobians along a motion, each as `null_space` returns it.
+
+    A choice of columns serves all matrices for which it is nearly as good as their own.
+
+    Parameters
+    ----------
+    jacobians : (count, m, n) array
+    rank : int
+
+    Returns
+    -------
+    bases : (count, n, n - rank) array
+    has_rank : (count,) array of bool
+        False if the smallest pivot is at most `MIN_PIVOT` times the largest.
+    """
+    count, rows, n = jacobians.shape
+    bases, has_rank, active = np.empty((count, n, n - rank)), np.ones(count, bool), np.arange(count)
+    while len(active):
+        first, active = active[0], active[1:]
+        bases[first], _, pivots, chosen = _null_space(jacobians[first], rank, np.zeros(rows))
+        has_rank[first] = not rank or pivots[-1] > MIN_PIVOT * pivots[0]
+        if not len(active) or not has_rank[first]:
+            continue
+        remaining = np.setdiff1d(np.arange(n), chosen)
+        q, r = np.linalg.qr(jacobians[active][:, :, chosen])
+        pivot = np.abs(np.diagonal(r, axis1=1, axis2=2)).min(axis=1, initial=np.inf)
+        serves = pivot > SHARED_PIVOT_RATIO * pivots.min(initial=np.inf) if rank else np.ones(len(active), bool)
+        right = np.swapaxes(q[serves], 1, 2) @ jacobians[active[serves]][:, :, remaining]
+        entries = -np.linalg.solve(r[serves], right)
+        is_small = np.abs(entries).max(axis=(1, 2), initial=0.0) <= MAX_SHARED_ENTRY
+        serves[serves] = is_small
+        basis = np.zeros((int(is_small.sum()), n, n - rank))
+        basis[:, chosen] = entries[is_small]
+        basis[:, remaining] = np.eye(n - rank)
+        bases[active[serves]], active = basis, active[~serves]
+    return bases, has_rank
 
 
 def pivoted_columns(matrix: Array) -> tuple[IntArray, Array]:

@@ -185,20 +185,21 @@ class Actuation:
 
         Parameters
         ----------
-        tangent : (n, d) array
+        tangent : (n, d) array, or (m, n, d)
             Basis of the velocities that the loops allow: rho, or any other.
-        force : (d,) array
+        force : (d,) array, or (m, d)
             In that basis: tangent^T u'.
 
         Returns
         -------
-        (motors,) array
+        (motors,) array, or (m, motors)
             Minimum of the norm weighted by `weights`. If the motors cannot produce the force, the least-squares
             solution.
         """
         scale = 1.0 / np.sqrt(self.weights)
-        transmission = (self.motors.transmission @ tangent).T
-        return np.asarray(scale * np.linalg.lstsq(transmission * scale, force, rcond=MIN_TRANSMISSION)[0], dtype=float)
+        transmission = np.swapaxes(self.motors.transmission @ tangent, -1, -2)
+        inverse = np.linalg.pinv(transmission * scale, rcond=MIN_TRANSMISSION)
+        return np.asarray(scale * (inverse @ force[..., None])[..., 0], dtype=float)
 
     def explain_overload(self, tau: Array) -> str:
         """Return which motor is furthest beyond its limits at torques tau, (motors,), as part of a message."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.linear_algebra import Factorization, null_space
+from ckc_pin.base.linear_algebra import MIN_PIVOT, Factorization, null_space
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
@@ -20,6 +20,7 @@ __all__ = [
     "CoriolisVelocity",
     "dae_acceleration",
     "multipliers",
+    "rank_loss_error",
     "reduced_acceleration",
     "require_mass",
     "spf_terms",
@@ -30,7 +31,6 @@ __all__ = [
 
 CoriolisVelocity = Literal["rho", "actual"]
 
-MIN_PIVOT = 1e-12  # of the largest pivot of J: below it J has lost rank
 MIN_INERTIA_RATIO = 1e-12  # of the largest root of a diagonal entry of D: below it the coordinate moves no mass
 MIN_INERTIA_EIGENVALUE = 1e-13  # of D with ones on its diagonal: below it a motion moves no mass
 
@@ -105,11 +105,17 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     mechanism = terms.mechanism
     tangent, particular, pivots = null_space(terms.at.J, mechanism.rank, residual)
     if mechanism.rank and not pivots[-1] > MIN_PIVOT * pivots[0]:
-        raise NumericalError(
-            "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
-            q_tree=mechanism.tree.named(mechanism.tree.to_coordinates(terms.q_tree)),
-        )
+        raise rank_loss_error(terms)
     return tangent, particular
+
+
+def rank_loss_error(terms: Terms) -> NumericalError:
+    """Return the error that J has lost rank."""
+    tree = terms.mechanism.tree
+    return NumericalError(
+        "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",
+        q_tree=tree.named(tree.to_coordinates(terms.q_tree)),
+    )
 
 
 def dae_acceleration(terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:

@@ -6,6 +6,7 @@ recursive Newton-Euler algorithm computes the wrench that each joint of the tree
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ import pinocchio as pin
 from ckc_pin.base.arrays import Array
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.mechanism.mechanism import Mechanism
-from ckc_pin.mechanism.pose import Pose, cross
+from ckc_pin.mechanism.pose import cross
 
-__all__ = ["friction_force", "joint_wrenches", "loop_wrenches"]
+__all__ = ["friction_force", "joint_wrenches", "joint_wrenches_along", "loop_wrenches", "loop_wrenches_along"]
 
 REST_TOLERANCE = 1e-12  # of the fastest coordinate: a smaller velocity is rounding and has no direction
 
@@ -45,16 +46,22 @@ def loop_wrenches(terms: Terms, multipliers: Array) -> dict[str, Array]:
     dict of str to (6,) array
         Force, N, then moment, N m, by loop. Couplings have none, since they constrain coordinates, not frames.
     """
-    mechanism, pose = terms.mechanism, terms.at.pose
-    jacobian, names = terms.at.body_jacobian, [loop for loop, _ in mechanism.closure.names]
+    return {name: wrench[0] for name, wrench in loop_wrenches_along([terms], multipliers[None]).items()}
+
+
+def loop_wrenches_along(states: Sequence[Terms], multipliers: Array) -> dict[str, Array]:
+    """Return `loop_wrenches` at m states of one mechanism, (m, 6) by loop, from multipliers (m, rows)."""
+    mechanism, poses = states[0].mechanism, _Poses(states)
+    jacobian, names = _body_jacobians(states), [loop for loop, _ in mechanism.closure.names]
     wrenches = {}
     for loop in mechanism.spec.loop:
         frame, other = (mechanism.frames.find(end, loop.name) for end in (loop.frame_a, loop.frame_b))
         rows = [name == loop.name for name in names]
         # If frame A is in the world, other directions may be fixed there too, so its wrench is minus that on B.
-        wrench = multipliers[rows] @ (jacobian[rows, frame.joint] if frame.joint else -jacobian[rows, other.joint])
-        origin = pose.rotation[frame.joint] @ frame.translation + pose.translation[frame.joint]
-        wrenches[loop.name] = _shift_reference(wrench[None], origin[None])[0]
+        joint, sign = (frame.joint, 1.0) if frame.joint else (other.joint, -1.0)
+        wrench = np.einsum("mr,mrk->mk", sign * multipliers[:, rows], jacobian[:, rows, joint])
+        origin = poses.rotation[:, frame.joint] @ frame.translation + poses.translation[:, frame.joint]
+        wrenches[loop.name] = _shift_reference(wrench, origin)
     return wrenches
 
 
@@ -82,27 +89,56 @@ def joint_wrenches(
     dict of str to (6,) array
         Force, N, then moment, N m, by joint.
     """
-    mechanism, pose = terms.mechanism, terms.at.pose
+    wrenches = joint_wrenches_along([terms], acceleration[None], multipliers[None], applied)
+    return {name: wrench[0] for name, wrench in wrenches.items()}
+
+
+def joint_wrenches_along(
+    states: Sequence[Terms], acceleration: Array, multipliers: Array, applied: Array | float = 0.0
+) -> dict[str, Array]:
+    """Return `joint_wrenches` at m states of one mechanism, (m, 6) by joint.
+
+    The other arguments are those of `joint_wrenches` at all states: (m, n), (m, rows) and (m, joints, 6) arrays.
+    """
+    mechanism, poses = states[0].mechanism, _Poses(states)
     tree = mechanism.tree
-    external = np.einsum("r,rjk->jk", multipliers, terms.at.body_jacobian)
-    external += mechanism.springs.body_wrenches(pose, terms.v_tree) + applied
-    in_joints = _rotate(_shift_reference(external, pose.translation), pose, to_world=False)
+    external = np.einsum("mr,mrjk->mjk", multipliers, _body_jacobians(states)) + applied
+    if mechanism.springs.between_frames:
+        external += [mechanism.springs.body_wrenches(terms.at.pose, terms.v_tree) for terms in states]
+    in_joints = _rotate(_shift_reference(external, poses.translation), np.swapaxes(poses.rotation, -1, -2))
 
-    def compute_forces(model: Any, data: Any, *state: Array) -> list[Array]:
-        pin.rnea(model, data, *state, [pin.Force(wrench) for wrench in in_joints])
-        return [np.array(force.vector) for force in data.f]
+    def compute_forces(model: Any, data: Any, wrenches: Array, *state: Array) -> list[Array]:
+        pin.rnea(model, data, *state, [pin.Force(wrench) for wrench in wrenches])
+        return [force.vector for force in data.f]
 
-    wrenches = _rotate(tree.evaluate(compute_forces, terms.q_tree, terms.v_tree, acceleration), pose, to_world=True)
-    joints = zip(list(tree.model.names), list(tree.model.joints), wrenches, strict=True)
-    return {name: wrench for name, joint, wrench in list(joints)[1:] if joint.nv == 1}
+    transmitted = np.array([
+        tree.evaluate(compute_forces, wrenches, terms.q_tree, terms.v_tree, a)
+        for terms, wrenches, a in zip(states, in_joints, acceleration, strict=True)
+    ])  # fmt: skip
+    in_world = _rotate(transmitted, poses.rotation)
+    joints = zip(list(tree.model.names), list(tree.model.joints), strict=True)
+    return {name: in_world[:, k] for k, (name, joint) in enumerate(joints) if k and joint.nv == 1}
+
+
+class _Poses:
+    """Poses of the bodies at m states: rotations (m, joints, 3, 3) and translations (m, joints, 3)."""
+
+    def __init__(self, states: Sequence[Terms]) -> None:
+        self.rotation = np.array([terms.at.pose.rotation for terms in states])
+        self.translation = np.array([terms.at.pose.translation for terms in states])
+
+
+def _body_jacobians(states: Sequence[Terms]) -> Array:
+    """Return `Kinematics.body_jacobian` at m states, shape (m, rows, joints, 6)."""
+    return np.array([terms.at.body_jacobian for terms in states])
 
 
 def _shift_reference(wrenches: Array, points: Array) -> Array:
-    """Convert wrenches (k, 6) about the world's origin to wrenches about points (k, 3)."""
-    return np.hstack([wrenches[:, :3], wrenches[:, 3:] - cross(points, wrenches[:, :3])])
+    """Convert wrenches (..., 6) about the world's origin to wrenches about points (..., 3)."""
+    return np.concatenate([wrenches[..., :3], wrenches[..., 3:] - cross(points, wrenches[..., :3])], axis=-1)
 
 
-def _rotate(wrenches: Array, pose: Pose, *, to_world: bool) -> Array:
-    """Rotate wrenches (joints, 6) from world axes to the axes of each joint, or back."""
-    rotation = pose.rotation if to_world else np.swapaxes(pose.rotation, 1, 2)
-    return np.concatenate([rotation @ wrenches[:, :3, None], rotation @ wrenches[:, 3:, None]], axis=1)[:, :, 0]
+def _rotate(wrenches: Array, rotation: Array) -> Array:
+    """Rotate wrenches (..., 6) by matrices (..., 3, 3)."""
+    force, moment = rotation @ wrenches[..., :3, None], rotation @ wrenches[..., 3:, None]
+    return np.concatenate([force, moment], axis=-2)[..., 0]

@@ -92,7 +92,7 @@ class Closure(Immutable):
         `BodyPose` defines these velocities. Rows of couplings are zero, since they constrain coordinates, not bodies.
         """
         bodies = BodyPose(pose, self.anchors)
-        jacobian = np.zeros((len(self.names), bodies.linear_part.shape[1]))
+        jacobian = np.zeros((len(self.names), 6 * len(pose.translation)))
         for group in self.groups:
             if not isinstance(group, Affine):
                 jacobian[group.out] = group.jacobian(bodies)

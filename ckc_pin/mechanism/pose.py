@@ -28,11 +28,11 @@ def dot_rows(e: Array, jacobian: Array) -> Array:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the cross products of the rows of two arrays. For a few vectors `np.cross` takes ten times as long."""
+    """Return the cross products of vectors (..., 3). For a few vectors `np.cross` takes ten times as long."""
     c = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    c[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-    c[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
-    c[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    c[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    c[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    c[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return c
 
 
@@ -170,14 +170,44 @@ class BodyPose(Pose):
     def __init__(self, pose: Pose, anchors: Anchors) -> None:
         self.tree, self.anchors, self.q_tree = pose.tree, anchors, pose.q_tree
         self.rotation, self.translation = pose.rotation, pose.translation
-        bodies = len(pose.translation)
-        self.linear_part = np.tile(np.eye(3, 6), bodies)
-        self.angular_part = np.tile(np.eye(3, 6, 3), bodies)
+
+    @lazy
+    def linear_part(self) -> Array:
+        """Linear velocities at the world's origin of all bodies, shape (3, 6 joints)."""
+        return np.tile(np.eye(3, 6), len(self.translation))
+
+    @lazy
+    def angular_part(self) -> Array:
+        """Angular velocities of all bodies, shape (3, 6 joints)."""
+        return np.tile(np.eye(3, 6, 3), len(self.translation))
 
     @lazy
     def support(self) -> Array:
         """1 where a column belongs to the body, shape (joints, 1, 6 joints)."""
         return np.repeat(np.eye(len(self.translation)), 6, axis=1)[:, None, :]
+
+    def project_r_jacobian(self, pair: IntArray, e: Array) -> Array:
+        """Return the rows e_i . d r_i of vectors e (k, 3), shape (k, 6 joints).
+
+        They are the wrenches of a force e on the body of A and of -e on that of B.
+        """
+        half, row = len(self.p) // 2, np.arange(len(pair))
+        wrenches = np.zeros((len(pair), len(self.translation), 6))
+        for sign, at in ((1.0, pair), (-1.0, half + pair)):
+            wrenches[row, self.anchors.point_joint[at]] += sign * np.hstack([e, cross(self.p[at], e)])
+        return wrenches.reshape(len(pair), -1)
+
+    def project_e_angular(self, direction: IntArray, torque: Array) -> Array:
+        """Return the rows torque_i . d omega_i of the bodies that directions are fixed to, shape (k, 6 joints)."""
+        wrenches = np.zeros((len(direction), len(self.translation), 6))
+        wrenches[np.arange(len(direction)), self.anchors.direction_joint[direction], 3:] = torque
+        return wrenches.reshape(len(direction), -1)
+
+    def angular(self, joint: IntArray) -> Array:
+        """Angular Jacobians of bodies, shape (k, 3, 6 joints)."""
+        jacobians = np.zeros((len(joint), 3, len(self.translation), 6))
+        jacobians[np.arange(len(joint)), :, joint, 3:] = np.eye(3)
+        return jacobians.reshape(len(joint), 3, -1)
 
 
 class Rate:

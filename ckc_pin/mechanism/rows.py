@@ -263,6 +263,7 @@ class RelativeLog(Immutable):
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330,
               854513 / 138, 236364091 / 2730, 8553103 / 6)  # fmt: skip
 _SERIES = [np.array([b / math.factorial(2 * k) for k, b in enumerate(_BERNOULLI, 1)])[::-1]]
+FEW_TERMS, SMALL_SQUARE = 3, 1e-4  # of theta^2: below it these terms are enough, as for closed loops
 _SERIES.append(2 * np.polyder(_SERIES[0]))  # (dc/dtheta) / theta is twice the derivative by theta^2
 
 
@@ -277,7 +278,8 @@ def _coefficients(u: Array, count: int) -> list[Array]:
     """Return c, and if `count` is 2 also (dc/dtheta) / theta, shape (k,) each."""
     square = np.sum(u * u, axis=1)
     if np.all(square < 1.0):
-        return [np.polyval(series, square) for series in _SERIES[:count]]
+        terms = FEW_TERMS if np.all(square < SMALL_SQUARE) else len(_BERNOULLI)
+        return [np.polyval(series[-terms:], square) for series in _SERIES[:count]]
     t = np.where(square < 1.0, 1.0, np.sqrt(square))
     cotangent, sine2 = 1 / np.tan(t / 2), np.sin(t / 2) ** 2
     c = 1 / t**2 - cotangent / (2 * t)

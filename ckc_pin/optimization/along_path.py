@@ -72,8 +72,10 @@ class PathDynamics(Immutable):
         return self.inertia * u + self.centrifugal * b + self.damping * np.sqrt(b) + self.static
 
 
-def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> PathDynamics:
-    """Return the equations of motion at places of a path.
+def path_dynamics(
+    dynamics: ReducedDynamics, path: CoordinatePath, s: Array, closed: PathDynamics | None = None
+) -> PathDynamics:
+    """Return the equations of motion at places of a path, with closed configurations as in `follow_places`.
 
     Raises
     ------
@@ -81,7 +83,7 @@ def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> 
         The loops do not let the mechanism follow the path.
     """
     q, q_s, q_ss = path.q(s)
-    q_tree = follow_places(dynamics, q, s, path.start)
+    q_tree = follow_places(dynamics, path, s, closed)
     zero, no_torque = np.zeros_like(q), np.zeros((len(s), dynamics.motors))
     at_rest = dynamics.instants(q_tree, zero, zero, no_torque)
     forth = dynamics.instants(q_tree, q_s, q_ss, no_torque)
@@ -101,16 +103,35 @@ def path_dynamics(dynamics: ReducedDynamics, path: CoordinatePath, s: Array) -> 
     )
 
 
-def follow_places(dynamics: ReducedDynamics, q: Array, s: Array, start: Array | None) -> Array:
-    """Return closed configurations at q (m, d), each followed from the one before, from a start or as assembled on.
+def follow_places(
+    dynamics: ReducedDynamics, path: CoordinatePath, s: Array, closed: PathDynamics | None = None
+) -> Array:
+    """Return closed configurations at places s (m,) of a path, each followed from the one before it.
+
+    Parameters
+    ----------
+    dynamics : ReducedDynamics
+    path : CoordinatePath
+    s : (m,) array
+        Not decreasing.
+    closed : PathDynamics, optional
+        Places with known closed configurations, from which the places behind them are closed together.
 
     Raises
     ------
     InputError
         The loops do not close.
     """
-    mechanism = dynamics.mechanism
-    start = mechanism.q_tree if start is None else start
+    if closed is not None:
+        before = np.maximum(np.searchsorted(closed.s, s, side="right") - 1, 0)
+        q_tree = dynamics.close(closed.q_tree[before], path.q(s)[0])
+        if q_tree is not None:
+            return q_tree
+        # The path may bend between the places.
+        places = np.union1d(s, closed.s)
+        return follow_places(dynamics, path, places)[np.searchsorted(places, s)]
+    mechanism, q = dynamics.mechanism, path.q(s)[0]
+    start = mechanism.q_tree if path.start is None else path.start
     q_tree = dynamics.follow(start, q)
     if q_tree is None:
         count = next(k for k in range(len(q)) if dynamics.follow(start, q[: k + 1]) is None)

@@ -61,10 +61,10 @@ def plan_along(mechanism: Mechanism, spec: OptimizeSpec, table: PathSpec, limits
     refuse_unsupported(mechanism, spec.minimize, limits, spec.desired)
     dynamics = ReducedDynamics(mechanism)
     path = make_path(table, mechanism) if table.shape != "free" else _find_free_path(dynamics, spec, table, limits)
-    motion, iterations, parts = _refine_profile(dynamics, path, limits, spec)
+    motion, along, iterations, parts = _refine_profile(dynamics, path, limits, spec)
     t_end = float(motion.corners[-1])
     for tolerance, rows in TABLES:
-        t, at, torque = _torque_table(dynamics, motion, limits.narrowed(LIMIT_TOLERANCE / 2), tolerance, rows)
+        t, at, torque = _torque_table(dynamics, motion, along, limits.narrowed(LIMIT_TOLERANCE / 2), tolerance, rows)
         replay = replay_plan(mechanism, dynamics, motion, at, t, torque)
         if replay.error <= REPLAY_ERROR:
             break
@@ -111,8 +111,8 @@ def _find_free_path(
 
 def _refine_profile(
     dynamics: ReducedDynamics, path: CoordinatePath, limits: MotionLimits, spec: OptimizeSpec
-) -> tuple[PathMotion, int, dict[str, float]]:
-    """Return the best motion along a path, iterations, and the parts of its cost.
+) -> tuple[PathMotion, PathDynamics, int, dict[str, float]]:
+    """Return the best motion along a path, the dynamics on its grid, iterations, and the parts of its cost.
 
     Intervals inside which a limit is exceeded are divided.
     """
@@ -121,11 +121,12 @@ def _refine_profile(
     s = s[np.concatenate([[True], np.diff(s) > MIN_SPACING])]
     narrowed, between, total = limits.narrowed(LIMIT_TOLERANCE), limits.narrowed(LIMIT_TOLERANCE / 2), 0
     inside = np.linspace(0.0, 1.0, CHECKS_PER_INTERVAL + 2)[1:-1]
+    along: PathDynamics | None = None
     suspect: BoolArray | None = None  # intervals to check; all of them before the end
     is_fastest = _is_fastest(spec, limits)
     time, corrected = limits.time, limits.time  # of the optimizer, whose durations have errors of its grid
     for round_ in range(MAX_REFINEMENTS):
-        along = path_dynamics(dynamics, path, s)
+        along = path_dynamics(dynamics, path, s, along)
         _require_within(limits, along, dynamics)
         if _is_bounded(limits):
             profile, iterations = find_fastest(dynamics, along, narrowed)
@@ -140,15 +141,15 @@ def _refine_profile(
             parts |= {"time": float(profile.t[-1])} if "time" in parts else {}
             corrected = _correct_time(profile, limits.time, time)
         motion, total = PathMotion(path, profile), total + iterations
-        exceeded = _exceeds_inside(dynamics, motion, between, inside, suspect)
+        exceeded = _exceeds_inside(dynamics, motion, along, between, inside, suspect)
         if not is_fastest:
             exceeded |= _misses_time(profile)
         elif round_ < SWITCH_REFINEMENTS:
             exceeded |= _switches(profile)
         if not exceeded.any() and suspect is not None:
-            exceeded = _exceeds_inside(dynamics, motion, between, inside, None)
+            exceeded = _exceeds_inside(dynamics, motion, along, between, inside, None)
         if not exceeded.any() and corrected == time:
-            return motion, total, parts
+            return motion, along, total, parts
         if not exceeded.any():
             suspect = None
             continue
@@ -218,13 +219,14 @@ def _parts(counts: IntArray) -> Array:
 
 
 def _exceeds_inside(
-    dynamics: ReducedDynamics, motion: PathMotion, limits: MotionLimits, inside: Array, which: BoolArray | None
-) -> BoolArray:
+    dynamics: ReducedDynamics, motion: PathMotion, along: PathDynamics, limits: MotionLimits, inside: Array,
+    which: BoolArray | None,
+) -> BoolArray:  # fmt: skip
     """Return whether the motion exceeds limits inside each interval, (intervals,); False where it is not checked."""
     corners = motion.corners
     at = np.arange(len(corners) - 1) if which is None else np.flatnonzero(which)
     t = corners[at, None] + np.diff(corners)[at, None] * inside
-    instants, missing = _instants(dynamics, motion, t.ravel(), limits)
+    instants, missing = _instants(dynamics, motion, along, t.ravel(), limits)
     excess = limits.excess(measure(dynamics.mechanism, dynamics, limits, instants)).max(axis=1)
     exceeded = np.zeros(len(corners) - 1, dtype=bool)
     exceeded[at] = ((excess > 0) | (missing > FORCE_TOLERANCE)).reshape(t.shape).any(axis=1)
@@ -232,16 +234,14 @@ def _exceeds_inside(
 
 
 def _instants(
-    dynamics: ReducedDynamics, motion: PathMotion, t: Array, limits: MotionLimits
+    dynamics: ReducedDynamics, motion: PathMotion, along: PathDynamics, t: Array, limits: MotionLimits
 ) -> tuple[MotionInstants, Array]:
     """Return a motion with the motor torques of smallest norm within limits, and the force that they do not produce.
 
     The force (m,) is relative to the largest one.
     """
     _, v, a = motion(t)
-    # The loops are followed through all corners, because the path may bend between the instants.
-    places = np.union1d(t, motion.corners)
-    q_tree = follow_places(dynamics, motion(places)[0], places, motion.path.start)[np.searchsorted(places, t)]
+    q_tree = follow_places(dynamics, motion.path, motion.profile(t)[0], along)
     at = dynamics.instants(q_tree, v, a, np.zeros((len(t), dynamics.motors)))
     friction = friction_force(dynamics.mechanism, at.v_tree)
     force = at.force - np.einsum("mnd,mn->md", dynamics.rho(q_tree), friction)
@@ -252,8 +252,9 @@ def _instants(
 
 
 def _torque_table(
-    dynamics: ReducedDynamics, motion: PathMotion, limits: MotionLimits, tolerance: float, max_rows: int
-) -> tuple[Array, MotionInstants, Array]:
+    dynamics: ReducedDynamics, motion: PathMotion, along: PathDynamics, limits: MotionLimits, tolerance: float,
+    max_rows: int,
+) -> tuple[Array, MotionInstants, Array]:  # fmt: skip
     """Return times, instants and motor torques of a table that is interpolated linearly.
 
     The table's torques have the same impulse between two rows as those of the motion: they differ from them by
@@ -264,12 +265,12 @@ def _torque_table(
     begin, end = corners[:-1] + gap / 2, corners[1:] - gap / 2
     begin[0], end[-1] = 0.0, corners[-1]
     three = np.stack([begin, (begin + end) / 2, end], axis=1)
-    tau = _instants(dynamics, motion, three.ravel(), limits)[0].tau.reshape(*three.shape, -1)
+    tau = _instants(dynamics, motion, along, three.ravel(), limits)[0].tau.reshape(*three.shape, -1)
     bend = tau[:, [0, 2]].mean(axis=1) - tau[:, 1]
     size = np.abs(bend).max(axis=1) / np.abs(tau).max()
     parts = np.clip(np.ceil(np.sqrt(size / tolerance)), 1, max_rows).astype(int)
     t = np.concatenate([np.linspace(a, b, n + 1) for a, b, n in zip(begin, end, parts, strict=True)])
-    instants, _ = _instants(dynamics, motion, t, limits)
+    instants, _ = _instants(dynamics, motion, along, t, limits)
     correction = np.repeat(2 / 3 * bend / parts[:, None] ** 2, parts + 1, axis=0)
     return t, instants, instants.tau - correction
 

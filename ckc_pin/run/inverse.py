@@ -18,7 +18,7 @@ import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.base.interrupt import acknowledge
-from ckc_pin.base.linear_algebra import Factorization, one_blas_thread
+from ckc_pin.base.linear_algebra import Factorization, null_spaces, one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
@@ -27,8 +27,8 @@ from ckc_pin.control.desired import Desired, find_rate_jump
 from ckc_pin.control.forces import body_wrenches, generalized_force
 from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.workspace import find_workspace_exit
-from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis, tree_force
-from ckc_pin.dynamics.inverse import friction_force, joint_wrenches, loop_wrenches
+from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, rank_loss_error, tangent_basis, tree_force
+from ckc_pin.dynamics.inverse import friction_force, joint_wrenches_along, loop_wrenches_along
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
@@ -55,6 +55,8 @@ CROSS_TOLERANCE = 1e-4
 DEAD_CENTRE_TOLERANCE = 1e-7
 # Singular values below this, relative to the largest, belong to joints whose holding forces depend on those of others.
 HOLDING_RANK_TOLERANCE = 1e-9
+MAX_BATCH = 64  # instants whose forces are computed together
+MAX_BATCH_ENTRIES = 65_536  # of their matrices (n, n), which stay in the cache
 
 
 @dataclass(frozen=True)
@@ -171,60 +173,124 @@ def _collect_motion(
     progress: Callable[[float, float], None] | None,
 ) -> MotionForces:
     """Compute the forces at all instants of a motion, until it ends, fails or is interrupted."""
-    rows: list[dict[str, Any]] = []
+    forces: list[dict[str, Any]] = []
     status: Status = "done"
     message = "reached the end of the motion"
     try:
+        for batch in _split_into_batches(motion, mechanism.n, t_end, progress):
+            _append_forces(forces, batch, mechanism, actuation)
+    except NumericalError as error:
+        if not forces:
+            raise
+        status, message = "stopped", f"stopped after t = {forces[-1]['t'][-1]:.6g} s: {error}"
+    except KeyboardInterrupt as signal:
+        if not forces:
+            raise
+        status, message = "interrupted", f"interrupted at t = {forces[-1]['t'][-1]:.6g} s{acknowledge(signal)}"
+    return collect_forces(forces, mechanism, actuation.limit, name=name, status=status, message=message)
+
+
+def _split_into_batches(
+    motion: Iterator[_Instant], n: int, t_end: float, progress: Callable[[float, float], None] | None
+) -> Iterator[list[_Instant]]:
+    """Yield the instants of a motion in batches. If the motion fails, the instants before come first."""
+    size = max(1, min(MAX_BATCH, MAX_BATCH_ENTRIES // n**2))
+    batch: list[_Instant] = []
+    try:
         for instant in motion:
-            rows.append(_compute_forces(instant, mechanism, actuation))
+            batch.append(instant)
             if progress is not None:
                 progress(instant.t, t_end)
-    except NumericalError as error:
-        if not rows:
-            raise
-        status, message = "stopped", f"stopped after t = {rows[-1]['t']:.6g} s: {error}"
-    except KeyboardInterrupt as signal:
-        if not rows:
-            raise
-        status, message = "interrupted", f"interrupted at t = {rows[-1]['t']:.6g} s{acknowledge(signal)}"
-    return collect_forces(rows, mechanism, actuation.limit, name=name, status=status, message=message)
+            if len(batch) == size:
+                yield batch
+                batch = []
+    except (NumericalError, KeyboardInterrupt) as reason:
+        if batch:
+            if isinstance(reason, KeyboardInterrupt):
+                acknowledge(reason)  # so that it is not raised again before the forces are computed
+            yield batch
+        raise
+    if batch:
+        yield batch
 
 
-def _compute_forces(instant: _Instant, mechanism: Mechanism, actuation: Actuation) -> dict[str, Any]:
-    """Solve eq. 1 at one instant for tau and the multipliers, and compute the joint wrenches that follow."""
-    terms, acceleration, t = instant.terms, instant.acceleration, instant.t
-    required = tree_force(terms, acceleration) - instant.other_force
-    if not np.all(np.isfinite(required)):
-        raise NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
-    tangent, _ = tangent_basis(terms, np.zeros(mechanism.closure.rows))
-    u_tree = mechanism.motors.force(instant.tau)
-    missing = tangent.T @ (required - u_tree)
-    tolerance = FORCE_TOLERANCE * np.abs(tangent.T) @ (np.abs(required) + np.abs(u_tree))
-    if np.any(np.abs(missing) > tolerance + CROSS_TOLERANCE * tolerance.max(initial=0.0)):
-        _require_actuated(mechanism, tangent, t)
-    tau = instant.tau + actuation.minimum_norm_torques(tangent, missing)
-    forces = multipliers(terms, mechanism.motors.force(tau) + instant.other_force, acceleration)
-    return {
-        "t": t,
-        "q_tree": mechanism.tree.to_coordinates(terms.q_tree),
-        "v_tree": terms.v_tree,
-        "a_tree": acceleration,
-        "tau": tau,
-        "multipliers": forces,
-        "loop_wrenches": loop_wrenches(terms, forces),
-        "joint_forces": joint_wrenches(terms, acceleration, forces, instant.link_wrenches),
-    }
+def _append_forces(
+    forces: list[dict[str, Any]], batch: list[_Instant], mechanism: Mechanism, actuation: Actuation
+) -> None:
+    """Solve eq. 1 at instants for tau and the multipliers, and append them with the joint wrenches that follow.
+
+    If there is no solution at an instant, those before are appended, and NumericalError is raised.
+    """
+    states = [instant.terms for instant in batch]
+    acceleration = np.array([instant.acceleration for instant in batch])
+    other_force = np.array([instant.other_force for instant in batch])
+    preload = np.array([instant.tau for instant in batch])
+    transmission = mechanism.motors.transmission
+    passive = np.array([tree_force(*x) for x in zip(states, acceleration, strict=True)])
+    required, u_tree = passive - other_force, preload @ transmission
+    tangent, has_rank = null_spaces(np.array([terms.at.J for terms in states]), mechanism.rank)
+    transposed = np.swapaxes(tangent, 1, 2)
+    missing = _multiply(transposed, required - u_tree)
+    tolerance = FORCE_TOLERANCE * _multiply(np.abs(transposed), np.abs(required) + np.abs(u_tree))
+    tolerance += CROSS_TOLERANCE * tolerance.max(axis=1, initial=0.0, keepdims=True)
+    needs_motors = np.isfinite(required).all(axis=1) & has_rank & (np.abs(missing) > tolerance).any(axis=1)
+    fails = ~np.isfinite(required).all(axis=1) | ~has_rank
+    fails[needs_motors] = _motor_motions(mechanism, tangent[needs_motors])[0][:, 0] <= DEAD_CENTRE_TOLERANCE**2
+    error: NumericalError | None = None
+    if fails.any():
+        k = int(np.argmax(fails))
+        error = _explain_failure(batch[k], mechanism, required[k], tangent[k] if has_rank[k] else None)
+        batch, states, acceleration = batch[:k], states[:k], acceleration[:k]
+    m = len(batch)
+    if m:
+        tau = preload[:m] + actuation.minimum_norm_torques(tangent[:m], missing[:m])
+        u_tree = tau @ transmission + other_force[:m]
+        lambdas = np.array([multipliers(*x) for x in zip(states, u_tree, acceleration, strict=True)])
+        applied = np.array([instant.link_wrenches for instant in batch])
+        forces.append({
+            "t": np.array([instant.t for instant in batch]),
+            "q_tree": np.array([mechanism.tree.to_coordinates(terms.q_tree) for terms in states]),
+            "v_tree": np.array([terms.v_tree for terms in states]),
+            "a_tree": acceleration,
+            "tau": tau,
+            "multipliers": lambdas,
+            "loop_wrenches": loop_wrenches_along(states, lambdas),
+            "joint_forces": joint_wrenches_along(states, acceleration, lambdas, applied),
+        })  # fmt: skip
+    if error:
+        raise error
 
 
-def _require_actuated(mechanism: Mechanism, tangent: Array, t: float) -> None:
-    """Raise NumericalError where no motor moves some freedom, for example at a rocker's dead centre."""
-    # Orthonormal motions, where lengths are relative to the mechanism's size.
+def _multiply(matrices: Array, vectors: Array) -> Array:
+    """Return the products of matrices (m, k, n) and vectors (m, n), shape (m, k)."""
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+def _motor_motions(mechanism: Mechanism, tangent: Array) -> tuple[Array, Array]:
+    """Return squares of motor motions by unit motions along principal directions, (..., d), and these (..., n, d).
+
+    `tangent` are bases (..., n, d). Lengths are relative to the mechanism's size.
+    """
     motions, _ = np.linalg.qr(tangent / mechanism.tree.step_scale[:, None])
     motor_motions = mechanism.motors.transmission @ motions
-    values, directions = np.linalg.eigh(motor_motions.T @ motor_motions)
-    if values[0] <= DEAD_CENTRE_TOLERANCE**2:
-        coordinate = mechanism.coordinates[int(np.argmax(np.abs(motions @ directions[:, 0])))]
-        raise NumericalError(f"the motion along {coordinate} is held by no actuator at t = {t:.6g} s", t=t)
+    values, directions = np.linalg.eigh(np.swapaxes(motor_motions, -1, -2) @ motor_motions)
+    return values, motions @ directions
+
+
+def _explain_failure(instant: _Instant, mechanism: Mechanism, required: Array, tangent: Array | None) -> NumericalError:
+    """Return why motors cannot provide a required force (n,).
+
+    The motion is not finite, J has lost rank (`tangent` is None), or no motor moves some freedom, for example at a
+    rocker's dead centre.
+    """
+    t = instant.t
+    if not np.all(np.isfinite(required)):
+        return NumericalError(f"the motion's rates or accelerations are not finite at t = {t:.6g} s", t=t)
+    if tangent is None:
+        return rank_loss_error(instant.terms)
+    _, directions = _motor_motions(mechanism, tangent)
+    coordinate = mechanism.coordinates[int(np.argmax(np.abs(directions[:, 0])))]
+    return NumericalError(f"the motion along {coordinate} is held by no actuator at t = {t:.6g} s", t=t)
 
 
 # --- motions -------------------------------------------------------------------------------------

@@ -261,7 +261,7 @@ class MotionForces(HasSummary):
 
 
 def collect_forces(
-    rows: Sequence[dict[str, Any]],
+    parts: Sequence[dict[str, Any]],
     mechanism: Mechanism,
     limit: Array,
     *,
@@ -269,18 +269,19 @@ def collect_forces(
     status: Status,
     message: str,
 ) -> MotionForces:
-    """Return the `MotionForces` of a sequence of instants.
+    """Return the `MotionForces` of consecutive parts of a motion.
 
     Parameters
     ----------
-    rows : sequence of dict
-        One dict for each instant, at least one: t, q_tree, v_tree, a_tree, tau, multipliers, and by name
-        loop_wrenches and joint_forces.
+    parts : sequence of dict
+        One dict for each part, at least one, with arrays of its instants: t, q_tree, v_tree, a_tree, tau, multipliers,
+        and by name loop_wrenches and joint_forces.
     mechanism, limit, name, status, message
         As in `MotionForces`.
     """
-    arrays = {key: np.array([row[key] for row in rows]) for key in ("t", "q_tree", "v_tree", "a_tree", "tau")}
-    forces, loops = np.array([row["multipliers"] for row in rows]), [loop for loop, _ in mechanism.closure.names]
+    keys = ("t", "q_tree", "v_tree", "a_tree", "tau", "multipliers")
+    arrays = {key: np.concatenate([part[key] for part in parts]) for key in keys}
+    forces, loops = arrays.pop("multipliers"), [loop for loop, _ in mechanism.closure.names]
     if mechanism.redundant:
         names = ", ".join(mechanism.redundant)
         message += f"; rows {names} are redundant, so loop and joint forces are those with minimum-norm multipliers"
@@ -291,11 +292,16 @@ def collect_forces(
         mechanism=mechanism,
         limit=limit,
         loop_forces={loop: forces[:, [x == loop for x in loops]] for loop in dict.fromkeys(loops)},
-        loop_wrenches={x: np.array([row["loop_wrenches"][x] for row in rows]) for x in rows[0]["loop_wrenches"]},
-        joint_forces={x: np.array([row["joint_forces"][x] for row in rows]) for x in rows[0]["joint_forces"]},
+        loop_wrenches=_join([part["loop_wrenches"] for part in parts]),
+        joint_forces=_join([part["joint_forces"] for part in parts]),
         exceeded=_find_exceeded_limits(arrays["t"], arrays["tau"], limit, mechanism.actuated),
         **arrays,
     )
+
+
+def _join(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    """Return the wrenches by name of consecutive parts of a motion."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _find_exceeded_limits(t: Array, tau: Array, limit: Array, motors: Sequence[str]) -> list[dict[str, Any]]:

@@ -80,7 +80,7 @@ def test_loops_with_springs(make: type, tmp_path: Path) -> None:
         )
 
 
-@pytest.mark.parametrize("angle", [1e-9, 1e-3, 0.4, 0.999, 1.001, 2.0, 3.0])
+@pytest.mark.parametrize("angle", [1e-9, 1e-3, 9.999e-3, 1.0001e-2, 0.4, 0.999, 1.001, 2.0, 3.0])
 def test_the_logarithm_of_a_rotation_differentiated_three_times(angle: float) -> None:
     """The reference is differences of the logarithm with many digits."""
     random = np.random.default_rng(0)

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ckc_pin.base.linear_algebra import MIN_PIVOT
 from ckc_pin.codegen.arguments import argument_names, argument_units, present, values
 from ckc_pin.codegen.c_source import count_operations, write_static_function
 from ckc_pin.codegen.comparison import TERMS_TOLERANCE
 from ckc_pin.codegen.library import explain_too_large
 from ckc_pin.codegen.term_functions import TermFunctions
-from ckc_pin.dynamics.formulations import MIN_PIVOT
 from ckc_pin.errors import InputError
 from ckc_pin.formats.c.names import comment, identifiers, initializer, table
 from ckc_pin.formats.c.vectors import QUANTITIES, write_vectors
