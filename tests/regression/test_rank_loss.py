@@ -199,6 +199,12 @@ def test_near_miss_of_branches_is_not_a_crossing(tmp_path: Path, excess: float, 
     assert np.abs(run.q_tree[:, run.column("crank")] - theta).max() <= min(1e4 * rtol, 1e-4)
 
 
+def test_near_miss_of_branches_costs_no_crossing_steps(tmp_path: Path) -> None:
+    """A crossing step needs at least fifty evaluations. The monitor does not expect one where J keeps its rank."""
+    stats = simulate(write_four_bar(tmp_path, ROCKER + 1e-2, "dae", 1e-3)).stats
+    assert stats["rhs"] <= 12 * (stats["steps"] + stats["rejected"]) + 3 * stats["steps"] + 6
+
+
 # --- cost of the rank monitor -----------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ namespace ckc {
 // it may be, and the tolerance of Newton's method for its expected time.
 constexpr double max_time_past_end = 0.3, max_centre_error = 0.04, newton_time_tolerance = 0.01;
 // Singular value at an expected crossing, relative to the present one, above which it is no crossing.
-constexpr double max_remaining_singular_value = 0.1;
+constexpr double max_remaining_singular_value = 0.01;
 constexpr double look_ahead_steps = 4.0;  // number of steps within which crossings are expected
 constexpr int max_attempts = 6, max_newton_steps = 10, manifold_checks = 9;
 // Bits of accuracy in the search for the smallest singular value, ahead of the step and within it.
