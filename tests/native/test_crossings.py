@@ -106,5 +106,5 @@ def test_monitor_sees_the_singular_position_itself(N):
     states = [np.concatenate([q_tree, np.ones(n)]) for q_tree in (regular, np.zeros(n), regular)]
     (before, _), (there, _), (after, _) = ready.loop.ranks(np.array(states))
     assert there < 1e-14
-    assert after == pytest.approx(before, rel=1e-12)
+    assert after == pytest.approx(before, rel=1e-6)
     assert before > 1e-3

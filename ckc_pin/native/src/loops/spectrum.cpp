@@ -14,9 +14,11 @@ constexpr int first_check = 4;                 // Lanczos steps before the first
 // Residual of the eigenvector, relative to the eigenvalue. The relative error of the eigenvalue is its square.
 constexpr double residual_tolerance = 1e-7;
 // Of Rayleigh quotient iteration: largest number of rows, for which dense factorizations cost little, largest number of
-// steps, and distance below the eigenvalue, relative to it, in which no other eigenvalue may lie.
+// steps, residual of the eigenvector, relative to the eigenvalue, and distance below the eigenvalue, relative to it, in
+// which no other eigenvalue may lie. A step converges cubically, so the residual is mostly much smaller.
 constexpr int max_continued_rows = 24, max_continued_steps = 4;
-constexpr double min_eigenvalue_distance = 1e-6, rounding = std::numeric_limits<double>::epsilon();
+constexpr double continued_residual_tolerance = 1e-3, min_eigenvalue_distance = 1e-4;
+constexpr double rounding = std::numeric_limits<double>::epsilon();
 
 // Start vector. Equal entries could be orthogonal to the smallest singular direction of a symmetric mechanism.
 static void fill_generic_vector(Out u) {
@@ -77,7 +79,7 @@ bool SmallestSingularValue::continue_from_last_vector() {
     next_.noalias() = gram_ * u_;
     smallest_ = u_.dot(next_);
     next_ -= smallest_ * u_;
-    if (next_.norm() <= std::max(residual_tolerance * smallest_, floor)) break;
+    if (next_.norm() <= std::max(continued_residual_tolerance * smallest_, floor)) break;
     if (k == max_continued_steps) return false;
     shifted_ = gram_;
     shifted_.diagonal().array() -= smallest_ - floor;
