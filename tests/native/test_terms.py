@@ -8,7 +8,7 @@ from ckc_pin.kinematics.loading import load
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.library import shipped
 from ckc_pin.native import _core
-from ckc_pin.native.tables import core_table
+from ckc_pin.native.tables import core_table, packed
 
 STATES = 200
 SPREAD = 0.3  # rad or m around the assembled configuration, off the constraint manifold
@@ -123,3 +123,18 @@ def test_invalid_partitions_are_rejected(q, z, says):
     core = _core.Core(core_table(load("five_bar")))
     with pytest.raises(ValueError, match=says):
         core.set_partition(q, z)
+
+
+@pytest.mark.parametrize("name", ["delta", "three_rrr", "stewart"])
+def test_inertia_is_as_exact_far_from_the_origin(name):
+    """Placements have rounding errors of 1e-12 m there, sums of moments about the origin errors of 1e-8 kg m^2."""
+    mechanism = load(name)
+    table = core_table(mechanism)
+    model = mechanism.tree.model.copy()
+    for joint, parent in enumerate(model.parents):
+        if joint and not parent:
+            model.jointPlacements[joint].translation += np.array([1e4, -2e4, 1e4])
+    far = _core.Core({**table, "model": packed(model)})
+    expected = Terms(mechanism, mechanism.kinematics(mechanism.q_tree), np.zeros(mechanism.n)).D_tree
+    computed = far.terms(mechanism.q_tree, np.zeros(mechanism.n))["D_tree"]
+    assert np.abs(computed - expected).max() <= 1e-10 * np.abs(expected).max()

@@ -142,7 +142,7 @@ nb::typed<nb::dict, nb::str, Matrix> terms(Core& core, VectorArg q_tree, VectorA
 Matrix jacobian(Core& core, VectorArg q_tree) {
   require(q_tree, core.tree.nq, "q_tree");
   core.set_configuration(q_tree), core.compute_J();
-  return core.constraints.J;
+  return core.constraints.J();
 }
 
 Vector reduced_acceleration(Core& core, VectorArg q_tree, VectorArg q_dot, VectorArg v_tree, VectorArg u_tree,
@@ -173,7 +173,7 @@ Vector dae_acceleration(Core& core, VectorArg q_tree, VectorArg v_tree, VectorAr
 nb::object term_by_name(Core& core, const std::string& name) {
   if (name == "at") return nb::none();
   if (name == "phi") return nb::cast(core.constraints.phi);
-  if (name == "J") return core.compute_J(), nb::cast(core.constraints.J);
+  if (name == "J") return core.compute_J(), nb::cast(core.constraints.J());
   if (name == "rho") return core.compute_rho(), nb::cast(core.rho);
   if (name == "D") return core.compute_D(), nb::cast(core.D);
   if (name == "bias_tree") return core.compute_bias(), nb::cast(core.bias_tree);

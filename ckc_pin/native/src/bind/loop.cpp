@@ -244,7 +244,7 @@ StepFailure failure(Loop& loop) {
   if (step_loop.sync_core()) {
     if (step_loop.control->needs_fixed_partition() || std::isfinite(step_loop.system->coordinate_margin()))
       failure.margin = step_loop.system->phi_z_margin();
-    failure.sigma_min = failure.margin * loop.core->constraints.J.norm();
+    failure.sigma_min = failure.margin * loop.core->constraints.J().norm();
   }
   failure.q_tree = loop.core->q_tree, failure.q = loop.core->q, failure.z = loop.core->z;
   return failure;

@@ -87,7 +87,7 @@ struct BoundSparseElimination {
   }
   std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
     core->set_configuration(q_tree, true), core->set_velocity(v_tree), core->compute_J(), core->compute_bias();
-    if (!elimination.compute(core->tree.D(), core->constraints.J)) return std::nullopt;
+    if (!elimination.compute(core->tree.D_entries(), core->constraints.J_entries())) return std::nullopt;
     Vector a(core->n);
     elimination.solve(u_tree - core->bias_tree + core->damping_tree, core->J_dot_v, a);
     return a;
@@ -107,7 +107,7 @@ struct BoundArticulatedElimination {
   bool compute(VectorArg q_tree) {
     core->set_configuration(q_tree), core->compute_J();
     elimination.bodies.set_configuration(core->tree);
-    return elimination.compute(core->constraints.J);
+    return elimination.compute(core->constraints.J_entries());
   }
   std::optional<Vector> acceleration(VectorArg q_tree, VectorArg v_tree, VectorArg u_tree) {
     if (!compute(q_tree)) return std::nullopt;

@@ -91,7 +91,7 @@ bool PointTrajectory::update_rows() {
   tree_.set_configuration(q_tree_);
   constraints_.update(tree_, q_tree_);
   constraints_.update_jacobian(tree_);
-  for (int i = 0; i < tree_.n; ++i) J_.row(i) = constraints_.J.row(task_.psi[i]);
+  for (int i = 0; i < tree_.n; ++i) J_.row(i) = constraints_.J().row(task_.psi[i]);
   factor_.compute(J_);
   return !factor_.singular() && constraints_.phi.allFinite();
 }

@@ -22,7 +22,7 @@ bool TrackingController::derivatives(Core& plant, const Indices& fixed_q, Matrix
   core.compute_rho(), core.compute_D_tree();
   const Vector v1 = uses_own_velocity ? Vector(core.rho * (r_ + v_)) : plant.v_tree, v2 = core.rho * v_;
   core.compute_J_dot(v1);
-  const Matrix J = core.constraints.J, &rho = core.rho;
+  const Matrix J = core.constraints.J(), &rho = core.rho;
   // Compute the z rows of x from its q rows, so that J x = -residual.
   const auto complete_dependent = [&](const Matrix& residual, Matrix& x) {
     Vector step(n), total_residual(m);

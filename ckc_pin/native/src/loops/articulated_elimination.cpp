@@ -30,6 +30,9 @@ WITH_WIDEST_REGISTERS static void multiply_innovations(const double* a, const do
 ArticulatedElimination::ArticulatedElimination(const Tree& tree, const ConstraintRows& rows, Indices kept)
     : bodies(tree), kept_(std::move(kept)) {
   const int count = static_cast<int>(kept_.size());
+  Indices first_in_row(1, 0);
+  for (const Indices& columns : rows.pattern)
+    first_in_row.push_back(first_in_row.back() + static_cast<int>(columns.size()));
   std::map<Indices, Indices> rows_by_coordinates;
   for (int i = 0; i < count; ++i) {
     std::set<int> moved;
@@ -43,9 +46,10 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
       group.coordinates = coordinates;
       for (size_t l = 0; l < group.rows.size(); ++l) {
         const int row = kept_[group.rows[l]];
+        int source = first_in_row[row];
         for (int j : rows.pattern[row]) {
           const auto place = std::lower_bound(coordinates.begin(), coordinates.end(), j) - coordinates.begin();
-          group.entries.push_back({static_cast<int>(place * block_size + l), row, j, 0.0});
+          group.entries.push_back({static_cast<int>(place * block_size + l), source++, j, 0.0});
         }
       }
       group.innovations.resize(static_cast<Eigen::Index>(coordinates.size()), block_size);
@@ -55,7 +59,7 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
   std::vector<Indices> pattern(count);
   for (int a = 0; a < static_cast<int>(groups_.size()); ++a)
     for (int b = a; b < static_cast<int>(groups_.size()); ++b) {
-      Pair pair{a, b, {}};
+      Pair pair{a, b, {}, {}};
       const Indices &of_a = groups_[a].coordinates, &of_b = groups_[b].coordinates;
       for (size_t i = 0, j = 0; i < of_a.size() && j < of_b.size();) {
         if (of_a[i] == of_b[j]) pair.places.emplace_back(i, j);
@@ -69,18 +73,32 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
           if (a != b || i <= j) pattern[std::max(i, j)].push_back(std::min(i, j));
       pairs_.push_back(std::move(pair));
     }
+  Indices first_entry(count + 1, 0);
+  for (int j = 0; j < count; ++j) {
+    std::sort(pattern[j].begin(), pattern[j].end());
+    first_entry[j + 1] = first_entry[j] + static_cast<int>(pattern[j].size());
+  }
+  for (Pair& pair : pairs_)
+    for (int i : groups_[pair.a].rows)
+      for (int j : groups_[pair.b].rows) {
+        const Indices& column = pattern[std::max(i, j)];
+        const auto place = std::lower_bound(column.begin(), column.end(), std::min(i, j)) - column.begin();
+        pair.entries.push_back(first_entry[std::max(i, j)] + static_cast<int>(place));
+      }
+  row_entries_.resize(first_entry[count]);
   rows_ = std::make_unique<SparseElimination>(pattern, std::vector<Indices>(), Indices());
   operations_ = rows_->operations();
-  inverse_pivots_.resize(tree.n), row_matrix_.setZero(count, count);
+  inverse_pivots_.resize(tree.n);
   rates_.setZero(count), multipliers_.setZero(count), one_.resize(tree.n, count);
 }
 
-bool ArticulatedElimination::compute(const Matrix& J) {
+bool ArticulatedElimination::compute(const std::vector<double>& J_entries) {
   if (!bodies.factorize()) return false;
   for (Group& group : groups_) {
     group.innovations.setZero();
     double* const innovations = group.innovations.data();
-    for (Group::Entry& entry : group.entries) innovations[entry.place] = entry.value = J(entry.row, entry.column);
+    for (Group::Entry& entry : group.entries)
+      innovations[entry.place] = entry.value = J_entries[static_cast<size_t>(entry.source)];
     bodies.eliminate(group.coordinates, group.innovations);
   }
   for (const Pair& pair : pairs_) {
@@ -91,12 +109,9 @@ bool ArticulatedElimination::compute(const Matrix& J) {
     double products[block_size][block_size];
     multiply_innovations(a.innovations.data(), b.innovations.data(), pair.places, inverse_pivots_.data(), rows, products[0]);
     for (int i = 0; i < rows; ++i)
-      for (int j = 0; j < columns; ++j) {
-        const auto [first, last] = std::minmax(a.rows[i], b.rows[j]);
-        row_matrix_(first, last) = products[i][j];
-      }
+      for (int j = 0; j < columns; ++j) row_entries_[pair.entries[i * columns + j]] = products[i][j];
   }
-  return rows_->compute(row_matrix_, no_rows_);
+  return rows_->compute(row_entries_, no_rows_);
 }
 
 // x += L^-1 J^T lambda, with the multipliers lambda that change the accelerations of the rows by `rates`.

@@ -21,7 +21,7 @@ class ArticulatedElimination {
   long visits() const { return visits_; }
   long operations() const { return operations_; }
   // Factorize, at the bodies' configuration. False if a pivot is so small that digits are lost.
-  bool compute(const Matrix& J);
+  bool compute(const std::vector<double>& J_entries);
   // As those of SparseElimination.
   void solve(In force, In residual, Out a);
   void solve_unit_forces(const Indices& at, Matrix& columns);
@@ -37,16 +37,17 @@ class ArticulatedElimination {
     Indices rows;         // among the kept ones
     Indices coordinates;  // on which the rows' forces act, and those above them; ascending
     struct Entry {
-      int place, row, column;  // of the transposed block, of J
+      int place, source, column;  // of the transposed block, among the entries of J, of J
       double value;
     };
     std::vector<Entry> entries;
     Block<block_size> innovations;  // L^-1 J^T
   };
-  // Two groups with common coordinates, and the places of these in both.
+  // Two groups with common coordinates.
   struct Pair {
     int a, b;
-    std::vector<std::pair<int, int>> places;
+    std::vector<std::pair<int, int>> places;  // of the coordinates in both
+    Indices entries;                          // by row of a, then by row of b: index into row_entries_
   };
   template <int size>
   struct Workspace {
@@ -63,7 +64,8 @@ class ArticulatedElimination {
   std::vector<Group> groups_;
   std::vector<Pair> pairs_;
   std::unique_ptr<SparseElimination> rows_;
-  Matrix row_matrix_, no_rows_;  // upper triangle of J D'^-1 J^T
+  std::vector<double> row_entries_;  // of the upper triangle of J D'^-1 J^T, by column
+  std::vector<double> no_rows_;
   long visits_ = 0, operations_ = 0;
   std::vector<double> inverse_pivots_;  // of a pair's places
   Vector rates_, multipliers_;

@@ -72,7 +72,7 @@ double ClosureSolver::residual_size() {
     z_.resize(z_count);
     core_.solve_z(residual_, z_);
     residual_.setZero();
-    for (Eigen::Index k = 0; k < z_count; ++k) residual_ += z_(k) * core_.constraints.J.col(core_.z[k]);
+    for (Eigen::Index k = 0; k < z_count; ++k) residual_ += z_(k) * core_.constraints.J().col(core_.z[k]);
   }
   return residual_.size() ? residual_.lpNorm<Eigen::Infinity>() : 0.0;
 }

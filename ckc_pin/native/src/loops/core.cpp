@@ -43,7 +43,6 @@ Core::Core(CoreTable table)
   if (table.rotors.size()) tree.set_parameters(Tree::Parameter::rotors, table.rotors);
   size_t entries = 0;
   for (const Indices& rows : tree.inertia_pattern) entries += 2 * rows.size();
-  D_values_.reserve(entries / 2);
   D_tree_is_dense_ = n > max_sparse_size && static_cast<double>(entries) > min_dense_share * n * n;
   choose_elimination();
 }
@@ -75,8 +74,8 @@ void Core::set_partition(Indices q_, Indices z_) {
   q = std::move(q_), z = std::move(z_);
   d = static_cast<int>(q.size());
   const int m = constraints.closure.rows, k = static_cast<int>(z.size());
-  const auto pattern = constraints.pattern_in(z, n);
-  phi_z.set_pattern(m, k, pattern), basis_.set_pattern(m, k, pattern);
+  const auto [pattern, places] = constraints.in_columns(z);
+  phi_z.set_pattern(m, k, pattern, places), basis_.set_pattern(m, k, pattern, places);
   basis_q_ = q, basis_z_ = z, basis_configuration_ = -1;
   D_factor.resize(d);
   rho.setZero(n, d), D.setZero(d, d), this->z_.setZero(k), d_.setZero(d);
@@ -115,7 +114,7 @@ void Core::set_parameters(Parameter parameter, In values) {
     constraints.set_parameters(static_cast<ConstraintRows::Parameter>(offset_from(Parameter::point)), values);
   else
     tree.set_parameters(static_cast<Tree::Parameter>(k), values);
-  if (parameter == Parameter::rotors) choose_elimination();  // rotors between branches couple coordinates
+  if (parameter == Parameter::rotors) D_tree_.resize(0, 0), choose_elimination();  // they couple other coordinates
   valid_parts_ = 0, basis_configuration_ = -1, ++configuration_count;
 }
 
@@ -123,7 +122,7 @@ bool Core::has_negative_determinant() {
   if (constraints.closure.rows != static_cast<int>(z.size()) || z.empty()) return false;
   Matrix square(z.size(), z.size());
   compute_J();
-  for (size_t k = 0; k < z.size(); ++k) square.col(k) = constraints.J.col(z[k]);
+  for (size_t k = 0; k < z.size(); ++k) square.col(k) = constraints.J().col(z[k]);
   return square.partialPivLu().determinant() < 0.0;
 }
 
@@ -132,14 +131,14 @@ void Core::set_configuration(In q_tree_, bool with_inertia) {
   q_tree = q_tree_;
   Profile::Entry entry(profile, with_inertia && !compiled ? Profile::D_tree : Profile::phi);
   if (compiled) {
-    compiled->evaluate_closure(q_tree, constraints.phi, constraints.J);
+    compiled->evaluate_closure(q_tree, constraints.phi, constraints.J_to_set());
     if (has_row_motion()) constraints.phi -= row_motion.value;
     valid_parts_ = jacobian_of_rows;
     return;
   }
   const bool needs_D = with_inertia && !eliminates_by_bodies();
   if (needs_D)
-    tree.compute_D(q_tree), gather_D_tree();
+    tree.compute_D(q_tree), set_D_tree();
   else
     tree.set_configuration(q_tree);
   valid_parts_ = (needs_D ? inertia_of_tree : 0u) | tree_is_set;
@@ -173,7 +172,7 @@ void Core::factorize_phi_z() {
   if (is_valid(factor_of_phi_z)) return;
   compute_J();
   Profile::Entry entry(profile, Profile::phi_z);
-  phi_z.compute(constraints.J, z);
+  phi_z.compute(constraints.J_entries());
   valid_parts_ |= factor_of_phi_z;
 }
 
@@ -182,11 +181,11 @@ void Core::compute_rho() {
   factorize_phi_z();
   Profile::Entry entry(profile, Profile::rho);
   for (int k = 0; k < d; ++k) {
-    residual_ = -constraints.J.col(q[k]);
+    constraints.J_column(q[k], residual_);
     phi_z.solve(residual_, z_);
     for (int i = 0; i < d; ++i) rho(q[i], k) = 0.0;
     rho(q[k], k) = 1.0;
-    for (size_t i = 0; i < z.size(); ++i) rho(z[i], k) = z_(i);
+    for (size_t i = 0; i < z.size(); ++i) rho(z[i], k) = -z_(i);
   }
   valid_parts_ |= rho_of_phi_z;
 }
@@ -194,20 +193,21 @@ void Core::compute_rho() {
 void Core::compute_D_tree() {
   if (is_valid(inertia_of_tree)) return;
   Profile::Entry entry(profile, Profile::D_tree);
-  if (compiled) {
-    if (!D_compiled_.size()) D_compiled_.setZero(n, n);
-    compiled->evaluate_D_tree(q_tree, D_compiled_);
-  } else
-    tree.compute_D(q_tree);
-  gather_D_tree();
   valid_parts_ |= inertia_of_tree;
+  if (!compiled) return tree.compute_D(q_tree), set_D_tree();
+  if (!D_tree_.size()) D_tree_.setZero(n, n);
+  compiled->evaluate_D_tree(q_tree, D_tree_);
+  D_compiled_entries_.clear();
+  for (int j = 0; j < n; ++j)
+    for (int i : tree.inertia_pattern[j]) D_compiled_entries_.push_back(D_tree_(i, j));
 }
 
-void Core::gather_D_tree() {
-  const Matrix& D = D_tree();
-  D_values_.clear();
+void Core::set_D_tree() {
+  if (!D_tree_is_dense_) return;
+  if (!D_tree_.size()) D_tree_.setZero(n, n);
+  const double* entry = tree.D_entries().data();
   for (int j = 0; j < n; ++j)
-    for (int i : tree.inertia_pattern[j]) D_values_.push_back(D(i, j));
+    for (int i : tree.inertia_pattern[j]) D_tree_(i, j) = *entry++;
 }
 
 void Core::compute_D() {
@@ -233,8 +233,7 @@ void Core::restrict_inertia(const Indices& independent, const Matrix& basis, Mat
   dependent_.clear();
   for (int k = 0; k < n; ++k)
     if (std::find(independent.begin(), independent.end(), k) == independent.end()) dependent_.push_back(k);
-  const Matrix& D = D_tree();
-  const auto entry = [&D](int i, int j) { return i <= j ? D(i, j) : D(j, i); };
+  const auto entry = [this](int i, int j) { return i <= j ? D_tree_(i, j) : D_tree_(j, i); };
   const int others = n - count;
   dependent_basis_.resize(others, count), D_dependent_.resize(others, others), D_between_.resize(count, others);
   for (int j = 0; j < others; ++j) {
@@ -250,7 +249,7 @@ void Core::restrict_inertia(const Indices& independent, const Matrix& basis, Mat
 }
 
 void Core::multiply_D_tree(In x, Out product) const {
-  const double* value = D_values_.data();
+  const double* value = D_entries().data();
   product.setZero();
   for (int j = 0; j < n; ++j) {
     double sum = 0.0, diagonal = 0.0;
@@ -271,7 +270,7 @@ double Core::joint_inertia(int k) {
   const bool is_factorized = elimination_is_accurate_ && factors_configuration_ == configuration_count;
   if (eliminates_by_bodies() && is_factorized) return articulated_->bodies.inertia(k);
   compute_D_tree();
-  return D_tree()(k, k);
+  return D_entries()[tree.D_diagonal[k]];
 }
 
 double Core::potential_energy() {
@@ -322,7 +321,7 @@ void Core::compute_J_dot(In v) {
 void Core::constraint_rate_derivative(In v, Matrix& by_q) {
   compute_J_dot(v);
   by_q = constraints.J_dot;
-  if (!tree.roots.empty()) compute_J(), by_q.noalias() -= constraints.J * tree.bracket_matrix(v);
+  if (!tree.roots.empty()) compute_J(), by_q.noalias() -= constraints.J() * tree.bracket_matrix(v);
 }
 
 void Core::compute_bias() {

@@ -243,13 +243,13 @@ class Core {
     tree_is_set = 512,
   };
   bool is_valid(Part part) const { return valid_parts_ & part; }
-  const Matrix& D_tree() const { return compiled ? D_compiled_ : tree.D(); }
+  const std::vector<double>& D_entries() const { return compiled ? D_compiled_entries_ : tree.D_entries(); }
   void update_tree();
   void update_row_rates();  // and bias_without_springs_
   void update_spring_lengths();
   void compute_spring_forces();                            // into elastic_
   bool find_tangent_basis(In residual, double min_pivot);  // into tangent_, and x_ with J x = -residual
-  void gather_D_tree();
+  void set_D_tree();  // from the entries that the tree has computed
   void restrict_inertia(const Indices& independent, const Matrix& basis, Matrix& restricted);
   void factorize_tangent_inertia();
   void add_force_response(In force, Out x);  // x = x_ plus the tangent motion that a force causes
@@ -282,8 +282,9 @@ class Core {
   // `configuration_count` of the last factorization without pivoting, and of the bodies' placement
   long factors_configuration_ = -1, bodies_configuration_ = -1;
   unsigned valid_parts_ = 0;  // bit set of `Part`: terms that are valid at q_tree and v_tree
-  Matrix C_tree_, D_compiled_, tangent_;
-  std::vector<double> D_values_;  // entries of D' in the order of tree.inertia_pattern, close together in memory
+  Matrix C_tree_, tangent_;
+  Matrix D_tree_;  // D' as a matrix, its upper triangle; without compiled terms only if `D_tree_is_dense_`
+  std::vector<double> D_compiled_entries_;  // entries of D_tree_ in the order of tree.inertia_pattern
   Matrix D_basis_, dependent_basis_, D_dependent_, D_between_;  // of `restrict_inertia`
   Indices dependent_;
   Indices basis_coordinates_;           // by column of the tangent basis: its coordinate

@@ -28,15 +28,15 @@ constexpr double acceleration_rounding_factor = 1e-13;
 bool Core::find_basis_by_partition() {
   if (basis_configuration_ != configuration_count) {
     basis_configuration_ = -1;
-    basis_.compute(constraints.J, basis_z_);
+    basis_.compute(constraints.J_entries());
     basis_coordinates_ = basis_q_;
     if (!(basis_.pivot_ratio() > min_partition_pivot)) return false;
     for (int k = 0; k < n - rank; ++k) {
-      residual_ = -constraints.J.col(basis_q_[k]);
+      constraints.J_column(basis_q_[k], residual_);
       basis_.solve(residual_, z_);
       tangent_.col(k).setZero();
       tangent_(basis_q_[k], k) = 1.0;
-      for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = z_(i);
+      for (size_t i = 0; i < basis_z_.size(); ++i) tangent_(basis_z_[i], k) = -z_(i);
     }
     if (!(largest_basis_entry() < max_partition_slope)) return false;
     basis_configuration_ = configuration_count;
@@ -66,12 +66,13 @@ void Core::take_pivots_as_partition() {
   if (pivots_ == basis_z_) return;
   basis_z_ = pivots_;
   basis_q_.assign(order.data() + rank, order.data() + n);
-  basis_.set_pattern(constraints.closure.rows, rank, constraints.pattern_in(basis_z_, n));
+  const auto [pattern, places] = constraints.in_columns(basis_z_);
+  basis_.set_pattern(constraints.closure.rows, rank, pattern, places);
 }
 
 // J P = Q [R S]. The columns without a pivot are the freedoms. Lengths are in units of the mechanism's size.
 bool Core::find_basis_by_pivoting(double min_pivot) {
-  qr_.compute(constraints.J * scales.columns.asDiagonal());
+  qr_.compute(constraints.J() * scales.columns.asDiagonal());
   const auto& r = qr_.matrixQR();
   const auto& order = qr_.colsPermutation().indices();
   if (rank && !(std::abs(r(rank - 1, rank - 1)) > min_pivot * std::abs(r(0, 0)))) return false;
@@ -154,10 +155,10 @@ bool Core::factorize_without_pivoting() {
   compute_J();
   if (articulated_) {
     placed_bodies();
-    elimination_is_accurate_ = articulated_->compute(constraints.J);
+    elimination_is_accurate_ = articulated_->compute(constraints.J_entries());
   } else {
     compute_D_tree();
-    elimination_is_accurate_ = sparse_->compute(D_tree(), constraints.J);
+    elimination_is_accurate_ = sparse_->compute(D_entries(), constraints.J_entries());
   }
   factors_configuration_ = configuration_count;
   return elimination_is_accurate_;
@@ -300,7 +301,8 @@ double Core::relative_difference(In a, In reference) {
   double largest = reference.cwiseQuotient(units).lpNorm<Eigen::Infinity>();
   for (int k = 0; k < n - rank; ++k) {
     const auto direction = tangent_.col(k);
-    const double inertia = direction.cwiseAbs2().dot(D_tree().diagonal());
+    double inertia = 0.0;
+    for (int j = 0; j < n; ++j) inertia += direction(j) * direction(j) * D_entries()[tree.D_diagonal[j]];
     const double uncancelled = inertia > 0.0 ? direction.cwiseAbs().dot(y_.cwiseAbs()) / inertia : 0.0;
     largest = std::max(largest, uncancelled * direction.cwiseQuotient(units).lpNorm<Eigen::Infinity>());
   }
@@ -395,7 +397,7 @@ void Core::minimum_norm_multipliers(In force, Out lambda) {
   if (!constraints.closure.rows) return;
   compute_J();
   transposed_.setThreshold(scales.rank);
-  transposed_.compute(scales.columns.asDiagonal() * constraints.J.transpose() * scales.rows.asDiagonal());
+  transposed_.compute(scales.columns.asDiagonal() * constraints.J().transpose() * scales.rows.asDiagonal());
   lambda = scales.rows.cwiseProduct(transposed_.solve(scales.columns.cwiseProduct(force)));
 }
 

@@ -29,11 +29,11 @@ bool Linearization::compute(In q_tree, In v, In u_tree, const Indices& locked, c
 }
 
 Linearization::Pivoted Linearization::factorize_with_locked_rows() const {
-  const Core& c = *core;
+  Core& c = *core;
   const Indices& locked = c.joints.locked;
   const Eigen::Index m = c.constraints.closure.rows;
   Matrix rows = Matrix::Zero(m + static_cast<Eigen::Index>(locked.size()), c.n);
-  rows.topRows(m) = c.scales.rows.asDiagonal() * c.constraints.J * c.scales.columns.asDiagonal();
+  rows.topRows(m) = c.scales.rows.asDiagonal() * c.constraints.J() * c.scales.columns.asDiagonal();
   for (size_t i = 0; i < locked.size(); ++i) rows(m + static_cast<Eigen::Index>(i), locked[i]) = 1.0;
   Pivoted qr;
   qr.setThreshold(c.scales.rank);
@@ -169,7 +169,7 @@ void Linearization::solve_multipliers() {
   if (!m) return;
   c.compute_J(), c.compute_bias(), c.compute_D_tree();
   Matrix J = Matrix::Zero(m + static_cast<Eigen::Index>(locked.size()), n);
-  J.topRows(m) = c.constraints.J;
+  J.topRows(m) = c.constraints.J();
   for (size_t i = 0; i < locked.size(); ++i) J(m + static_cast<Eigen::Index>(i), locked[i]) = 1.0;
   const Eigen::Index rank = n - T.cols();  // independent of rounding in redundant rows
   const Eigen::BDCSVD<Matrix> svd(J, Eigen::ComputeThinU | Eigen::ComputeThinV);

@@ -85,7 +85,7 @@ bool find_best_partition(Core& core, Partition& best) {
   }
   core.compute_J();
   best = {};
-  const Matrix J = core.scales.rows.asDiagonal() * core.constraints.J * core.scales.columns.asDiagonal();
+  const Matrix J = core.scales.rows.asDiagonal() * core.constraints.J() * core.scales.columns.asDiagonal();
   if (core.rank && !choose_dependent(core, J, best.z)) return false;
   std::sort(best.z.begin(), best.z.end());
   for (int k = 0; k < core.n; ++k)

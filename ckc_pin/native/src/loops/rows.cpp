@@ -55,7 +55,8 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   const auto joints = [&](int out, std::initializer_list<int> list) {
     joints_of_row[out] = list;
     for (int joint : list)
-      if (joint || wrenches_[out].size() < 2) wrenches_[out].push_back({joint, {}, Vector6::Zero(), Vector6::Zero()});
+      if (joint || wrenches_[out].size() < 2)
+        wrenches_[out].push_back({joint, {}, {}, Vector6::Zero(), Vector6::Zero()});
   };
   for (const auto& row : c.components)
     joints(row.out, {c.point_joint[row.pair], c.point_joint[pair_count_ + row.pair], c.direction_joint[row.direction]});
@@ -68,9 +69,10 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
   for (const auto& rows : c.logs) used.insert(rows.joint_a), used.insert(rows.joint_b);
   used.erase(0);  // the world does not move
   joints_.assign(used.begin(), used.end());
-  phi.setZero(c.rows), set_zero(J, c.rows, tree.n), set_zero(J_dot, c.rows, tree.n);
+  phi.setZero(c.rows), set_zero(J_, c.rows, tree.n), set_zero(J_dot, c.rows, tree.n);
   curve_values_.assign(c.curves.size(), Vector4::Zero()), curve_rates_.setZero(c.curves.size());
-  for (const auto& row : c.affine) J.row(row.out) = row.coefficients;
+  for (const auto& row : c.affine) J_.row(row.out) = row.coefficients;
+  places_in_column_.resize(tree.n);
   for (int i = 0; i < c.rows; ++i) {
     std::set<int> columns;
     for (Wrench& wrench : wrenches_[i]) {
@@ -83,10 +85,19 @@ ConstraintRows::ConstraintRows(const Tree& tree, Closure table) : closure(std::m
       columns.insert(wrench.coordinates.begin(), wrench.coordinates.end());
     }
     for (int j = 0; j < tree.n; ++j)
-      if (J(i, j) != 0.0) columns.insert(j);
+      if (J_(i, j) != 0.0) columns.insert(j);
     for (const auto& curve : c.curves)
       if (curve.out == i) columns.insert(curve.coordinate);
     pattern[i].assign(columns.begin(), columns.end());
+    for (Wrench& wrench : wrenches_[i])
+      for (int j : wrench.coordinates) {
+        const auto place = std::lower_bound(pattern[i].begin(), pattern[i].end(), j);
+        wrench.places.push_back(static_cast<int>(place - pattern[i].begin()));
+      }
+    for (int j : pattern[i]) {
+      places_in_column_[j].emplace_back(i, static_cast<int>(J_entries_.size()));
+      J_entries_.push_back(J_(i, j));
+    }
   }
 }
 
@@ -95,10 +106,12 @@ void ConstraintRows::set_parameters(Parameter parameter, In values) {
     for (size_t k = 0; k < closure.point_local.size(); ++k) closure.point_local[k] = values.segment<3>(3 * k);
   if (parameter == Parameter::length)
     for (auto& row : closure.distances) row.length = values(row.out);
-  const auto n = J.cols();
+  const auto n = J_.cols();
   for (auto& row : closure.affine) {
-    if (parameter == Parameter::affine)
-      row.coefficients = values.segment(n * row.out, n), J.row(row.out) = row.coefficients;
+    if (parameter == Parameter::affine) {
+      row.coefficients = values.segment(n * row.out, n), J_.row(row.out) = row.coefficients;
+      for (int j : pattern[row.out]) entry(row.out, j) = row.coefficients(j);
+    }
     if (parameter == Parameter::affine_offset) row.offset = values(row.out);
   }
 }
@@ -212,14 +225,52 @@ void ConstraintRows::update_relative_rotation_rates(const Tree& tree) {
 
 void ConstraintRows::update_jacobian(const Tree& tree) {
   const Matrix6x& columns = tree.jacobian();
-  for (int i = 0; i < closure.rows; ++i) {
+  double* entries = J_entries_.data();
+  for (int i = 0; i < closure.rows; entries += pattern[i++].size()) {
     if (wrenches_[i].empty()) continue;  // the Jacobian of an affine row is constant, except for its curve
-    for (int j : pattern[i]) J(i, j) = 0.0;
+    std::fill_n(entries, pattern[i].size(), 0.0);
     for (const auto& wrench : wrenches_[i])
-      for (int j : wrench.coordinates) J(i, j) += wrench.w.dot(columns.col(j));
+      for (size_t k = 0; k < wrench.coordinates.size(); ++k)
+        entries[wrench.places[k]] += wrench.w.dot(columns.col(wrench.coordinates[k]));
   }
   for (size_t k = 0; k < closure.curves.size(); ++k)
-    J(closure.curves[k].out, closure.curves[k].coordinate) = -curve_values_[k](1);
+    entry(closure.curves[k].out, closure.curves[k].coordinate) = -curve_values_[k](1);
+  J_entries_are_set_ = true, J_is_set_ = false;
+}
+
+// Of J_entries_.
+double& ConstraintRows::entry(int i, int j) {
+  const auto& places = places_in_column_[j];
+  const auto at = std::lower_bound(places.begin(), places.end(), std::pair<int, int>(i, 0));
+  return J_entries_[static_cast<size_t>(at->second)];
+}
+
+const std::vector<double>& ConstraintRows::J_entries() {
+  if (!J_entries_are_set_) {
+    double* entry = J_entries_.data();
+    for (int i = 0; i < closure.rows; ++i)
+      for (int j : pattern[i]) *entry++ = J_(i, j);
+    J_entries_are_set_ = true;
+  }
+  return J_entries_;
+}
+
+const Matrix& ConstraintRows::J() {
+  if (!J_is_set_) {
+    const double* entry = J_entries_.data();
+    for (int i = 0; i < closure.rows; ++i)
+      for (int j : pattern[i]) J_(i, j) = *entry++;
+    J_is_set_ = true;
+  }
+  return J_;
+}
+
+Matrix& ConstraintRows::J_to_set() { return J_is_set_ = true, J_entries_are_set_ = false, J_; }
+
+void ConstraintRows::J_column(int j, Out column) {
+  const std::vector<double>& entries = J_entries();
+  column.setZero();
+  for (const auto& [row, place] : places_in_column_[j]) column(row) = entries[static_cast<size_t>(place)];
 }
 
 void ConstraintRows::update_jacobian_dot(const Tree& tree, const Matrix6x& columns_dot) {
@@ -248,29 +299,32 @@ void ConstraintRows::bias(Out J_dot_v) const {
   }
 }
 
-void ConstraintRows::multiply_J(In v, Out product) const {
+void ConstraintRows::multiply_J(In v, Out product) {
+  const double* entry = J_entries().data();
   for (int i = 0; i < closure.rows; ++i) {
     double sum = 0.0;
-    for (int j : pattern[i]) sum += J(i, j) * v(j);
+    for (int j : pattern[i]) sum += *entry++ * v(j);
     product(i) = sum;
   }
 }
 
-double ConstraintRows::J_norm() const {
+double ConstraintRows::J_norm() {
   double square = 0.0;
-  for (int i = 0; i < closure.rows; ++i)
-    for (int j : pattern[i]) square += J(i, j) * J(i, j);
+  for (double entry : J_entries()) square += entry * entry;
   return std::sqrt(square);
 }
 
-std::vector<Indices> ConstraintRows::pattern_in(const Indices& columns, int n) const {
-  Indices at(n, -1);
+ConstraintRows::Columns ConstraintRows::in_columns(const Indices& columns) const {
+  Indices at(places_in_column_.size(), -1);
   for (size_t j = 0; j < columns.size(); ++j) at[columns[j]] = static_cast<int>(j);
-  std::vector<Indices> pattern_of_columns(closure.rows);
-  for (int i = 0; i < closure.rows; ++i)
-    for (int j : pattern[i])
-      if (at[j] >= 0) pattern_of_columns[i].push_back(at[j]);
-  return pattern_of_columns;
+  Columns part{std::vector<Indices>(pattern.size()), std::vector<Indices>(pattern.size())};
+  int place = 0;
+  for (size_t i = 0; i < pattern.size(); ++i)
+    for (int j : pattern[i]) {
+      if (at[j] >= 0) part.pattern[i].push_back(at[j]), part.places[i].push_back(place);
+      ++place;
+    }
+  return part;
 }
 
 }  // namespace ckc

@@ -58,6 +58,7 @@ struct Closure {
 struct Wrench {
   int joint;
   Indices coordinates;  // that move the joint, without those that move everything the row is attached to
+  Indices places;       // of the coordinates in the row's pattern
   Vector6 w, w_dot;
 };
 
@@ -68,16 +69,26 @@ class ConstraintRows {
   Closure closure;
   // By row: columns of J that are not zero. Coordinates that move everything the row is attached to do not change it.
   std::vector<Indices> pattern;
-  Vector phi;       // (rows)
-  Matrix J, J_dot;  // (rows, n); outside the pattern zero, except for rounding errors of compiled terms
+  Vector phi;    // (rows)
+  Matrix J_dot;  // (rows, n); outside the pattern zero, except for rounding errors of compiled terms
 
   // Replace one kind of parameter: points concatenated; lengths, coefficients and offsets of all rows.
   enum class Parameter { point, length, affine, affine_offset };
   void set_parameters(Parameter parameter, In values);
-  // Return the pattern restricted to `columns`, as indices into them.
-  std::vector<Indices> pattern_in(const Indices& columns, int n) const;
+  // The part of J in some columns. By row: its pattern, as indices into the columns, and the places of these entries
+  // in `J_entries`.
+  struct Columns {
+    std::vector<Indices> pattern, places;
+  };
+  Columns in_columns(const Indices& columns) const;
   void update(const Tree& tree, In q);  // phi and the wrenches; requires the tree's placements
   void update_jacobian(const Tree& tree);  // requires update
+  // J as its entries, row by row in the order of `pattern`, and as a matrix like J_dot. In a large matrix the entries
+  // are far apart in memory, so each is computed from the other only when it is needed.
+  const std::vector<double>& J_entries();
+  const Matrix& J();
+  Matrix& J_to_set();  // the matrix, for a caller that computes all of it
+  void J_column(int j, Out column);
   // Rates of the wrenches; `motion` provides the joints' velocities and bias accelerations at v.
   template <class Motion>
   void update_rates(const Tree& tree, const Motion& motion, In v) {
@@ -87,14 +98,19 @@ class ConstraintRows {
   }
   void update_jacobian_dot(const Tree& tree, const Matrix6x& tree_jacobian_dot);
   void bias(Out J_dot_v) const;  // requires update_rates
-  void multiply_J(In v, Out product) const;
-  double J_norm() const;
+  void multiply_J(In v, Out product);
+  double J_norm();
 
  private:
+  double& entry(int i, int j);
   void update_rates(const Tree& tree, In v);
   void update_relative_rotations(const Tree& tree);
   void update_relative_rotation_rates(const Tree& tree);
 
+  Matrix J_;
+  std::vector<double> J_entries_;
+  bool J_is_set_ = true, J_entries_are_set_ = false;
+  std::vector<std::vector<std::pair<int, int>>> places_in_column_;  // by column: rows, and places in J_entries_
   int pair_count_;
   std::vector<Vector4> curve_values_;             // by curve: p and its derivatives
   Vector curve_rates_;                            // by curve: rate of its coordinate

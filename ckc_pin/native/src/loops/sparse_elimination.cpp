@@ -36,11 +36,17 @@ SparseElimination::SparseElimination(const std::vector<Indices>& inertia_pattern
     const auto [first, last] = std::minmax(place_[i], place_[j]);
     return value_at[static_cast<size_t>(first) * size + last];
   };
+  int source = 0;
   for (int j = 0; j < n_; ++j)
-    for (int i : inertia_pattern[j]) inertia_entries_.push_back({value_of(i, j), i, j, place_[i], place_[j], 0.0});
-  for (int i = n_; i < size; ++i)
+    for (int i : inertia_pattern[j]) inertia_entries_.push_back({value_of(i, j), source++, place_[i], place_[j], 0.0});
+  Indices first_in_row(1, 0);
+  for (const Indices& columns : row_pattern)
+    first_in_row.push_back(first_in_row.back() + static_cast<int>(columns.size()));
+  for (int i = n_; i < size; ++i) {
+    source = first_in_row[kept_[i - n_]];
     for (int j : row_pattern[kept_[i - n_]])
-      jacobian_entries_.push_back({value_of(i, j), kept_[i - n_], j, place_[i], place_[j], 0.0});
+      jacobian_entries_.push_back({value_of(i, j), source++, place_[i], place_[j], 0.0});
+  }
   for (int p = 0; p < size; ++p)  // one update for each pair of entries of a column
     for (int e = column_start_[p]; e < column_start_[p + 1]; ++e) {
       first_run_.push_back(static_cast<int>(runs_.size()));
@@ -88,12 +94,15 @@ Indices SparseElimination::choose_order(std::vector<std::vector<char>>& coupled)
   return order;
 }
 
-bool SparseElimination::compute(const Matrix& D, const Matrix& J) {
+bool SparseElimination::compute(const std::vector<double>& D_entries, const std::vector<double>& J_entries) {
   values_.setZero(), sums_.setZero();
-  for (Entry& entry : inertia_entries_) values_(entry.index) = entry.value = D(entry.row, entry.column);
-  for (Entry& entry : jacobian_entries_) values_(entry.index) = entry.value = J(entry.row, entry.column);
+  for (Entry& entry : inertia_entries_) {
+    values_(entry.index) = entry.value = D_entries[static_cast<size_t>(entry.source)];
+    if (entry.place_of_row == entry.place_of_column) sums_(entry.place_of_row) = entry.value;
+  }
+  for (Entry& entry : jacobian_entries_)
+    values_(entry.index) = entry.value = J_entries[static_cast<size_t>(entry.source)];
   const int size = static_cast<int>(place_.size());
-  for (int j = 0; j < n_; ++j) sums_(place_[j]) = D(j, j);
   double* const values = values_.data();
   for (int p = 0; p < size; ++p) {
     const int first = column_start_[p], last = column_start_[p + 1];

@@ -17,8 +17,9 @@ class SparseElimination {
 
   // Multiplications of one factorization and one solution.
   long operations() const { return operations_; }
-  // Factorize, from the upper triangle of D'. False if a pivot is so small that digits are lost.
-  bool compute(const Matrix& D, const Matrix& J);
+  // Factorize, from the entries of D' and J in the order of their patterns. False if a pivot is so small that digits
+  // are lost.
+  bool compute(const std::vector<double>& D_entries, const std::vector<double>& J_entries);
   // Solve D' a = force + J^T lambda, J a = -residual, with one step of iterative refinement: J D'^-1 J^T has the square of
   // J's condition number.
   void solve(In force, In residual, Out a);
@@ -34,7 +35,7 @@ class SparseElimination {
     int target, source, length;
   };
   struct Entry {
-    int index, row, column;           // index into values_; row and column of D' or J
+    int index, source;  // index into values_, and among the entries of D' or J
     int place_of_row, place_of_column;
     double value;
   };

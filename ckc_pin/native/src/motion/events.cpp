@@ -144,13 +144,13 @@ bool Events::value_at_core(int k, double t, double& value) {
     case Event::q_dot: value = system_.velocity(event.coordinate) - event.value; break;
     case Event::sigma_min_phi_z:
       core.compute_J();
-      phi_z_.resize(core.constraints.J.rows(), static_cast<Eigen::Index>(core.z.size()));
-      for (size_t j = 0; j < core.z.size(); ++j) phi_z_.col(j) = core.constraints.J.col(core.z[j]);
+      phi_z_.resize(core.constraints.J().rows(), static_cast<Eigen::Index>(core.z.size()));
+      for (size_t j = 0; j < core.z.size(); ++j) phi_z_.col(j) = core.constraints.J().col(core.z[j]);
       value = svd_phi_z_.compute(phi_z_).singularValues()(core.rank - 1) - event.value;
       break;
     case Event::sigma_min_J:
       core.compute_J();
-      value = svd_J_.compute(core.constraints.J).singularValues()(core.rank - 1) - event.value;
+      value = svd_J_.compute(core.constraints.J()).singularValues()(core.rank - 1) - event.value;
       break;
     case Event::function:
       if (!event.evaluate(t, system_, value)) return false;

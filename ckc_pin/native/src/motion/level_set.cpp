@@ -176,7 +176,7 @@ bool LevelSet::exact_jacobian(double t, In y, Matrix& jacobian) {
   if (!core.tree.roots.empty()) {
     const Matrix rotated = core.tree.bracket_matrix(v_tree) * core.rho;
     for (int k = 0; k < d; ++k) {  // solve J x = J rotated.col(k) for x in z only
-      residual_.noalias() = core.constraints.J * rotated.col(k);
+      residual_.noalias() = core.constraints.J() * rotated.col(k);
       core.closure_step_in_z(residual_, step_);
       rho_dot_.col(k) -= step_;
     }

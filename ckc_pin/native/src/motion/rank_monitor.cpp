@@ -19,7 +19,7 @@ RankMonitor::RankMonitor(const Core& core) : smallest_singular_value_(core.const
 
 double RankMonitor::value(Core& core) {
   core.compute_J();
-  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, true);
+  smallest_singular_value_.compute(core.constraints.J(), core.scales.rows, core.scales.columns, true);
   return smallest_singular_value_.value() / smallest_singular_value_.root_mean_square();
 }
 
@@ -30,11 +30,11 @@ RankMonitor::Rank RankMonitor::evaluate(System& system) {
   core.compute_J_dot(system.velocity);
   if (has_two_rows(core)) {
     Rank rank;
-    find_rank_of_two_rows(core.constraints.J.data(), core.constraints.J_dot.data(), core.scales.rows.data(),
+    find_rank_of_two_rows(core.constraints.J().data(), core.constraints.J_dot.data(), core.scales.rows.data(),
                           core.scales.columns.data(), core.n, rank.value, rank.rate);
     return rank;
   }
-  smallest_singular_value_.compute(core.constraints.J, core.scales.rows, core.scales.columns, true);
+  smallest_singular_value_.compute(core.constraints.J(), core.scales.rows, core.scales.columns, true);
   smallest_singular_value_.compute_vectors(u_, v_);
   const double singular_value = v_.norm(), mean = smallest_singular_value_.root_mean_square();
   v_.array() *= core.scales.columns.array();

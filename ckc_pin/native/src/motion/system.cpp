@@ -315,11 +315,12 @@ double System::phi_z_margin() {
   }
   core.compute_J();
   const Vector &rows = core.scales.rows, &columns = core.scales.columns;
-  phi_z_singular_value_->compute(core.constraints.J, rows, columns);
+  phi_z_singular_value_->compute(core.constraints.J(), rows, columns);
   double square = 0.0;
+  const double* entry = core.constraints.J_entries().data();
   for (int i = 0; i < core.constraints.closure.rows; ++i)
     for (int j : core.constraints.pattern[i]) {
-      const double scaled = rows(i) * core.constraints.J(i, j) * columns(j);
+      const double scaled = rows(i) * *entry++ * columns(j);
       square += scaled * scaled;
     }
   return phi_z_singular_value_->value() / std::max(std::sqrt(square), 1e-300);

@@ -29,14 +29,14 @@ bool Sensitivities::project_sensitivities(In v, Matrix& s) {
   closure_derivatives(v, row_, phi_dot_derivative);
   core_.compute_D_tree(), core_.compute_J();
   force_.setZero();
-  row_ += core_.constraints.J * s.topRows(n);
+  row_ += core_.constraints.J() * s.topRows(n);
   if (!core_.solve_acceleration_derivatives(force_, row_, derivative_) ||
       (locked && !core_.unit_force_responses(core_.joints.locked, responses_)))
     return false;
   if (locked) add_locked_correction(derivative_);
   s.topRows(n) += derivative_;
   for (int k = 0; k < n; ++k) phi_dot_derivative += derivatives_.rate_by_q.col(table_.real_v[k]) * s.row(k);
-  row_ = phi_dot_derivative + core_.constraints.J * s.bottomRows(n);
+  row_ = phi_dot_derivative + core_.constraints.J() * s.bottomRows(n);
   if (!core_.solve_acceleration_derivatives(force_, row_, derivative_)) return false;
   derivative_ += s.bottomRows(n);
   if (locked) add_locked_correction(derivative_);

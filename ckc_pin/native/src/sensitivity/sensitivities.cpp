@@ -70,7 +70,7 @@ void Sensitivities::compute_balance(Matrix& q, Matrix& force_derivative, Matrix&
   compute(none, none, lambda, false);
   Matrix phi_derivative, phi_dot_derivative;
   closure_derivatives(none, phi_derivative, phi_dot_derivative);
-  solve_dependent(core_.constraints.J * q + phi_derivative, q);
+  solve_dependent(core_.constraints.J() * q + phi_derivative, q);
   force_.setZero(n, count), row_.setZero(core_.constraints.closure.rows, count);
   add_parameters(none, none, lambda, false, force_, row_);
   Matrix by_q(n, n);
@@ -119,11 +119,11 @@ bool Sensitivities::start(In v, Matrix& s) {
     q -= core_.rho * factorization.solve(force_derivative);
     compute(v, none, no_force, false);
   } else {
-    solve_dependent(core_.constraints.J * q + phi_derivative, q);
+    solve_dependent(core_.constraints.J() * q + phi_derivative, q);
   }
   s.topRows(n) = q;
   for (int k = 0; k < n; ++k) phi_dot_derivative += derivatives_.rate_by_q.col(table_.real_v[k]) * q.row(k);
-  solve_dependent(core_.constraints.J * q_dot_derivative + phi_dot_derivative, q_dot_derivative);
+  solve_dependent(core_.constraints.J() * q_dot_derivative + phi_dot_derivative, q_dot_derivative);
   s.bottomRows(n) = q_dot_derivative;
   return s.allFinite();
 }

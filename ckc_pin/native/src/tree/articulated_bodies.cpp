@@ -20,7 +20,6 @@ using Spatial = ArticulatedBodies::Spatial;
 using SpatialInertia = ArticulatedBodies::SpatialInertia;
 using Coordinate = ArticulatedBodies::Coordinate;
 using Motion = ArticulatedBodies::Motion;
-using RigidBody = ArticulatedBodies::RigidBody;
 
 INLINE Vector8& vector_of(double* x) { return *reinterpret_cast<Vector8*>(x); }
 INLINE const Vector8& vector_of(const double* x) { return *reinterpret_cast<const Vector8*>(x); }
@@ -50,30 +49,10 @@ INLINE Spatial spatial(const Vector3& linear, const Vector3& angular) {
   return {{linear.x(), linear.y(), linear.z(), 0.0, angular.x(), angular.y(), angular.z(), 0.0}};
 }
 
-INLINE Vector3 moment_of(const RigidBody& body) { return {body.moment[0], body.moment[1], body.moment[2]}; }
-
-INLINE Vector3 momentum(const RigidBody& body, const Vector3& velocity, const Vector3& omega) {
-  return body.mass * velocity + omega.cross(moment_of(body));
-}
-
-INLINE Vector3 angular_momentum(const RigidBody& body, const Vector3& velocity, const Vector3& omega) {
-  Vector3 turning;
-  for (int i = 0; i < 3; ++i)
-    turning(i) = body.inertia[i][0] * omega(0) + body.inertia[i][1] * omega(1) + body.inertia[i][2] * omega(2);
-  return moment_of(body).cross(velocity) + turning;
-}
-
 // Twice the kinetic energy of a motion.
 INLINE double inertia_along(const RigidBody& body, const Spatial& motion) {
   const Vector3 velocity = linear(motion), omega = angular(motion);
   return velocity.dot(momentum(body, velocity, omega)) + omega.dot(angular_momentum(body, velocity, omega));
-}
-
-INLINE void add(const RigidBody& term, RigidBody& sum) {
-  sum.mass += term.mass;
-  for (int i = 0; i < 4; ++i) sum.moment[i] += term.moment[i];
-  for (int c = 0; c < 3; ++c)
-    for (int i = 0; i < 4; ++i) sum.inertia[c][i] += term.inertia[c][i];
 }
 
 INLINE void add(const RigidBody& body, SpatialInertia& sum) {
@@ -211,13 +190,7 @@ void ArticulatedBodies::set_configuration(const Tree& tree) {
   }
   for (size_t joint = 1; joint < bodies_.size(); ++joint) {
     const Tree::Body in_world = tree.body(static_cast<int>(joint));
-    const double m = in_world.mass, x = in_world.centre.x() - reference_.x(), y = in_world.centre.y() - reference_.y(),
-                 z = in_world.centre.z() - reference_.z();
-    const Matrix3& about_centre = in_world.inertia;
-    const double xx = about_centre(0, 0) + m * (y * y + z * z), xy = about_centre(0, 1) - m * x * y,
-                 yy = about_centre(1, 1) + m * (x * x + z * z), xz = about_centre(0, 2) - m * x * z,
-                 zz = about_centre(2, 2) + m * (x * x + y * y), yz = about_centre(1, 2) - m * y * z;
-    bodies_[joint] = {m, {m * x, m * y, m * z, 0.0}, {{xx, xy, xz, 0.0}, {xy, yy, yz, 0.0}, {xz, yz, zz, 0.0}}};
+    bodies_[joint] = rigid_body(in_world.mass, in_world.centre - reference_, in_world.inertia);
   }
 }
 

@@ -6,6 +6,7 @@
 // L^-T one from the roots to the leaves.
 #pragma once
 
+#include "tree/rigid_body.hpp"
 #include "tree/tree.hpp"
 
 namespace ckc {
@@ -30,11 +31,6 @@ class ArticulatedBodies {
     double armature, inertia;  // of all that the coordinate moves: D'(k, k)
     double inverse;            // of the pivot
     Spatial axis, force;       // force: articulated inertia times axis
-  };
-  struct RigidBody {
-    double mass;
-    double moment[4];      // mass times centre of mass, 0
-    double inertia[3][4];  // rows, about the reference point
   };
   struct Motion {
     Spatial velocity, acceleration, force;  // force: that this acceleration takes

@@ -15,8 +15,10 @@ constexpr int fill_in_factor = 2;
 // Space for rows that the elimination of a column changes, per column.
 constexpr int expected_eliminations = 4;
 
-void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& pattern) {
-  rows_ = rows, columns_ = columns, pattern_ = pattern, is_small_ = rows == columns && rows <= max_dense_rows;
+void Factor::set_pattern(int rows, int columns, const std::vector<Indices>& pattern,
+                         const std::vector<Indices>& places) {
+  rows_ = rows, columns_ = columns, pattern_ = pattern, places_ = places;
+  is_small_ = rows == columns && rows <= max_dense_rows;
   Indices first(columns, rows);
   for (int i = rows - 1; i >= 0; --i)
     for (int j : pattern[i]) first[j] = i;
@@ -61,30 +63,36 @@ double Factor::pivot(int k) const {
   return k < row_capacity_[i] && k >= row_begin_[i] ? values_[static_cast<size_t>(row_start_[i] + k)] : 0.0;
 }
 
-void Factor::compute(const Matrix& a, const Indices& columns) {
-  const auto at = [&](int j) { return columns.empty() ? j : columns[j]; };
+void Factor::compute(const Matrix& a) {
+  if (rows_ != columns_) return qr_ = a, singular_ = false, householder();
+  compute_from([&](int i, size_t p) { return a(i, pattern_[i][p]); });
+}
+
+void Factor::compute(const std::vector<double>& entries) {
+  compute_from([&](int i, size_t p) { return entries[places_[i][p]]; });
+}
+
+template <class Entry>
+void Factor::compute_from(const Entry& entry) {
   singular_ = false;
   if (rows_ != columns_) {
-    for (int j = 0; j < columns_; ++j) qr_.col(j) = a.col(at(j));
-    return householder();
-  }
-  if (is_small_) {
+    qr_.setZero();
     for (int i = 0; i < rows_; ++i)
-      for (int k = 0; k < rows_; ++k) row(i)[k] = a(i, at(column_at_[k]));
-    return eliminate_small();
+      for (size_t p = 0; p < pattern_[i].size(); ++p) qr_(i, pattern_[i][p]) = entry(i, p);
+    return householder();
   }
   for (int i = 0; i < rows_; ++i) {
     // Clear the fill-in of the previous factorization.
     double* const values = row(i);
-    std::fill(values + row_begin_[i], values + row_end_[i], 0.0);
+    std::fill(values + row_begin_[i], values + (is_small_ ? rows_ : row_end_[i]), 0.0);
     row_end_[i] = row_begin_[i];
-    for (int j : pattern_[i]) {
-      const int k = position_of_[j];
-      values[k] = a(i, at(j));
+    for (size_t p = 0; p < pattern_[i].size(); ++p) {
+      const int k = position_of_[pattern_[i][p]];
+      values[k] = entry(i, p);
       row_end_[i] = std::max(row_end_[i], k + 1);
     }
   }
-  eliminate();
+  is_small_ ? eliminate_small() : eliminate();
 }
 
 void DefiniteFactor::resize(int size) {

@@ -14,10 +14,11 @@ namespace ckc {
 // loops then cost as much as each one alone, and a chain of loops costs as much as a banded matrix.
 class Factor {
  public:
-  // Set the size of the matrices and their sparsity pattern: by row, the columns that are not zero.
-  void set_pattern(int rows, int columns, const std::vector<Indices>& pattern);
-  // Factorize the given columns of a matrix (all if `columns` is empty). Entries outside the pattern must be zero.
-  void compute(const Matrix& a, const Indices& columns = {});
+  // Set the size of the matrices and their sparsity pattern: by row, the columns that are not zero. `places`: by row,
+  // where these entries are in a list of entries.
+  void set_pattern(int rows, int columns, const std::vector<Indices>& pattern, const std::vector<Indices>& places = {});
+  void compute(const Matrix& a);  // entries outside the pattern must be zero
+  void compute(const std::vector<double>& entries);
   void solve(In b, Out x);             // least squares if the matrix is tall
   void solve_transposed(In b, Out x);  // minimum-norm solution of A^T x = b; tall matrices only
   bool singular() const { return singular_; }
@@ -27,12 +28,14 @@ class Factor {
   double* row(int i) { return values_.data() + row_start_[i]; }  // of L U: its entry k in place k
   double pivot(int k) const;                                    // zero if no row has an entry for it
   void extend_row(int i, int end);
+  template <class Entry>
+  void compute_from(const Entry& entry);  // entry(i, p): that of the p-th column in the pattern of row i
   void eliminate();
   void eliminate_small();
   void householder();
 
   int rows_ = 0, columns_ = 0;
-  std::vector<Indices> pattern_;
+  std::vector<Indices> pattern_, places_;
   Indices column_at_;    // column_at_[k]: column of the matrix that is eliminated as the k-th
   Indices position_of_;  // inverse of column_at_
   std::vector<double> values_;             // of L U; zero behind the interval of a row

@@ -1,6 +1,5 @@
 #include "tree/tree.hpp"
 
-#include <pinocchio/algorithm/crba.hpp>
 #include <pinocchio/algorithm/energy.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/rnea-derivatives.hpp>
@@ -12,7 +11,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "tree/large_pages.hpp"
+#include "tree/rigid_body.hpp"
 #include "tree/rotation.hpp"
 
 namespace ckc {
@@ -37,7 +36,6 @@ static pin::Data make_data(const pin::Model& model) {
                         &data.dFda})
     columns->setZero(6, n);
   for (auto* vector : {&data.tau, &data.nle, &data.g}) vector->setZero(n);
-  set_zero(data.M, n, n);
   data.Fcrb.assign(1, pin::Data::Matrix6x::Zero(6, n));  // the only one that is used
   data.mass.assign(joints, -1.0);
   data.a_gf[0] = -model.gravity;
@@ -54,7 +52,11 @@ static pin::Data make_data(const pin::Model& model) {
 struct Tree::Workspace {
   pin::Model model;
   pin::Data data;
-  explicit Workspace(pin::Model&& loaded) : model(std::move(loaded)), data(make_data(model)) {}
+  std::vector<RigidBody> composites;  // by joint: all bodies that it moves, as one
+  Matrix6x axes;                      // the Jacobian at the reference point of `composites`
+  std::vector<double> D_entries;
+  explicit Workspace(pin::Model&& loaded)
+      : model(std::move(loaded)), data(make_data(model)), composites(model.njoints) {}
 };
 
 static pin::Model load_model(const std::string& serialized) {
@@ -83,7 +85,13 @@ Tree::Tree(const std::string& serialized, Indices q_index_) : q_index(std::move(
       ancestors[k] = support[joint];
     }
   }
-  inertia_pattern = ancestors;
+  set_inertia_pattern(ancestors);
+}
+
+void Tree::set_inertia_pattern(std::vector<Indices> pattern) {
+  inertia_pattern = std::move(pattern), D_diagonal.resize(n);
+  int entries = 0;
+  for (int j = 0; j < n; ++j) entries += static_cast<int>(inertia_pattern[j].size()), D_diagonal[j] = entries - 1;
 }
 
 Tree::~Tree() = default;
@@ -105,16 +113,16 @@ void Tree::set_parameters(Parameter parameter, In values) {
 }
 
 void Tree::set_rotors(In values) {
-  rotors_.setZero(n, n), shared_rotor_.assign(n, {}), inertia_pattern = ancestors;
-  workspace_->data.M.setZero();  // its entries of earlier rotors between branches
+  rotors_.setZero(n, n);
+  std::vector<Indices> pattern = ancestors;
   for (int j = 0; j < n; ++j)
     for (int i = 0; i <= j; ++i) {
       rotors_(i, j) = rotors_(j, i) = values(n * i + j);
       if (rotors_(i, j) == 0.0) continue;
-      shared_rotor_[j].push_back(i);
-      if (!std::binary_search(ancestors[j].begin(), ancestors[j].end(), i)) inertia_pattern[j].push_back(i);
+      if (!std::binary_search(ancestors[j].begin(), ancestors[j].end(), i)) pattern[j].push_back(i);
     }
-  for (Indices& rows : inertia_pattern) std::sort(rows.begin(), rows.end());
+  for (Indices& rows : pattern) std::sort(rows.begin(), rows.end());
+  set_inertia_pattern(std::move(pattern));
 }
 
 void Tree::set_configuration(In q) { pin::computeJointJacobians(workspace_->model, workspace_->data, q); }
@@ -125,19 +133,38 @@ Matrix3 Tree::rotation(int joint) const { return workspace_->data.oMi[joint].rot
 
 Vector3 Tree::translation(int joint) const { return workspace_->data.oMi[joint].translation(); }
 
+// The composite rigid body algorithm in world axes. Pinocchio's writes a matrix, whose entries are far apart in memory.
+// The reference point is on the mechanism: far from it, sums of moments lose digits.
 void Tree::compute_D(In q) {
-  pin::crba(workspace_->model, workspace_->data, q, pin::Convention::WORLD);
-  if (!rotors_.size()) return;
-  Matrix& D = workspace_->data.M;
-  for (int j = 0; j < n; ++j)
-    for (int i : shared_rotor_[j]) {
-      // The algorithm writes the entries of ancestors only.
-      const bool is_written = std::binary_search(ancestors[j].begin(), ancestors[j].end(), i);
-      D(i, j) = (is_written ? D(i, j) : 0.0) + rotors_(i, j);
+  set_configuration(q);
+  auto& [model, data, composites, axes, entries] = *workspace_;
+  const Vector3 reference = translation(joints > 1 ? 1 : 0);
+  for (int joint = 1; joint < joints; ++joint) {
+    const Body in_world = body(joint);
+    composites[joint] = rigid_body(in_world.mass, in_world.centre - reference, in_world.inertia);
+  }
+  for (int joint = joints - 1; joint > 0; --joint)
+    if (parent[joint]) add(composites[joint], composites[parent[joint]]);
+  axes.resize(6, n), entries.clear();
+  for (int j = 0; j < n; ++j) {
+    const Vector3 omega = data.J.col(j).tail<3>();
+    axes.col(j) << data.J.col(j).head<3>() + omega.cross(reference), omega;
+  }
+  for (int j = 0; j < n; ++j) {
+    const RigidBody& composite = composites[joint_of[j]];
+    const Vector3 velocity = axes.col(j).head<3>(), omega = axes.col(j).tail<3>();
+    Vector6 force;
+    force << momentum(composite, velocity, omega), angular_momentum(composite, velocity, omega);
+    auto ancestor = ancestors[j].begin();
+    for (int i : inertia_pattern[j]) {
+      double entry = rotors_.size() ? rotors_(i, j) : 0.0;
+      if (ancestor != ancestors[j].end() && *ancestor == i) entry += axes.col(i).dot(force), ++ancestor;
+      entries.push_back(i == j ? entry + model.armature(j) : entry);
     }
+  }
 }
 
-const Matrix& Tree::D() const { return workspace_->data.M; }
+const std::vector<double>& Tree::D_entries() const { return workspace_->D_entries; }
 
 const Vector& Tree::compute_bias(In q, In v) {
   return pin::nonLinearEffects(workspace_->model, workspace_->data, q, v);
@@ -173,7 +200,7 @@ double Tree::potential_energy(In q) { return pin::computePotentialEnergy(workspa
 void Tree::compute_derivatives(In q, In v, In a, bool gravity, Matrix& by_q, Matrix& by_v) {
   pin::Model& model = workspace_->model;
   pin::Data& data = workspace_->data;
-  if (!data.dtau_dq.size()) data.dtau_dq.setZero(n, n), data.dtau_dv.setZero(n, n);
+  if (!data.M.size()) data.M.setZero(n, n), data.dtau_dq.setZero(n, n), data.dtau_dv.setZero(n, n);
   pin::computeRNEADerivatives(model, data, q, v, a);
   by_q = data.dtau_dq, by_v = data.dtau_dv;
   if (gravity) return;  // placements, motions and Jacobian are those at this state

@@ -28,6 +28,7 @@ class Tree {
   // By coordinate j: the rows i <= j where D' may be different from zero. These are the ancestors, and coordinates that
   // share a rotor with j.
   std::vector<Indices> inertia_pattern;
+  Indices D_diagonal;              // by coordinate: place of its entry on the diagonal among `D_entries`
   Indices joint_of;                // by coordinate: its joint
   Indices parent;                  // by joint
 
@@ -47,9 +48,9 @@ class Tree {
   Matrix3 rotation(int joint) const;
   Vector3 translation(int joint) const;
 
-  // Compute the upper triangle of D', and everything that `set_configuration` computes.
+  // Compute the entries of D' in the order of `inertia_pattern`, and everything that `set_configuration` computes.
   void compute_D(In q);
-  const Matrix& D() const;
+  const std::vector<double>& D_entries() const;
 
   // Compute C'v + h', the spatial velocities, and the accelerations at dv/dt = 0.
   const Vector& compute_bias(In q, In v);
@@ -99,9 +100,9 @@ class Tree {
 
  private:
   void set_rotors(In values);
+  void set_inertia_pattern(std::vector<Indices> pattern);
 
-  Matrix rotors_;                      // (n, n); empty without motors on several joints that have a rotor
-  std::vector<Indices> shared_rotor_;  // by coordinate j: the rows i <= j where rotors_ is not zero
+  Matrix rotors_;  // (n, n); empty without motors on several joints that have a rotor
   struct Workspace;
   std::unique_ptr<Workspace> workspace_;
 };
