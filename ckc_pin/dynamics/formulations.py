@@ -110,7 +110,7 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
 
 
 def rank_loss_error(terms: Terms) -> NumericalError:
-    """Return the error that J has lost rank."""
+    """Return the error for a configuration at which J has lost rank."""
     tree = terms.mechanism.tree
     return NumericalError(
         "the loop closure's Jacobian J has lost rank: the mechanism has more freedoms here than elsewhere",

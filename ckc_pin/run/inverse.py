@@ -233,8 +233,8 @@ def _append_forces(
     missing = _multiply(transposed, required - u_tree)
     tolerance = FORCE_TOLERANCE * _multiply(np.abs(transposed), np.abs(required) + np.abs(u_tree))
     tolerance += CROSS_TOLERANCE * tolerance.max(axis=1, initial=0.0, keepdims=True)
-    needs_motors = np.isfinite(required).all(axis=1) & has_rank & (np.abs(missing) > tolerance).any(axis=1)
-    fails = ~np.isfinite(required).all(axis=1) | ~has_rank
+    fails = ~(np.isfinite(required).all(axis=1) & has_rank)
+    needs_motors = ~fails & (np.abs(missing) > tolerance).any(axis=1)
     fails[needs_motors] = _motor_motions(mechanism, tangent[needs_motors])[0][:, 0] <= DEAD_CENTRE_TOLERANCE**2
     error: NumericalError | None = None
     if fails.any():
@@ -278,7 +278,7 @@ def _motor_motions(mechanism: Mechanism, tangent: Array) -> tuple[Array, Array]:
 
 
 def _explain_failure(instant: _Instant, mechanism: Mechanism, required: Array, tangent: Array | None) -> NumericalError:
-    """Return why motors cannot provide a required force (n,).
+    """Return the error that tells why the motors cannot provide a required force (n,).
 
     The motion is not finite, J has lost rank (`tangent` is None), or no motor moves some freedom, for example at a
     rocker's dead centre.

@@ -30,9 +30,7 @@ WITH_WIDEST_REGISTERS static void multiply_innovations(const double* a, const do
 ArticulatedElimination::ArticulatedElimination(const Tree& tree, const ConstraintRows& rows, Indices kept)
     : bodies(tree), kept_(std::move(kept)) {
   const int count = static_cast<int>(kept_.size());
-  Indices first_in_row(1, 0);
-  for (const Indices& columns : rows.pattern)
-    first_in_row.push_back(first_in_row.back() + static_cast<int>(columns.size()));
+  const Indices first_in_row = first_entries(rows.pattern);
   std::map<Indices, Indices> rows_by_coordinates;
   for (int i = 0; i < count; ++i) {
     std::set<int> moved;
@@ -73,19 +71,16 @@ ArticulatedElimination::ArticulatedElimination(const Tree& tree, const Constrain
           if (a != b || i <= j) pattern[std::max(i, j)].push_back(std::min(i, j));
       pairs_.push_back(std::move(pair));
     }
-  Indices first_entry(count + 1, 0);
-  for (int j = 0; j < count; ++j) {
-    std::sort(pattern[j].begin(), pattern[j].end());
-    first_entry[j + 1] = first_entry[j] + static_cast<int>(pattern[j].size());
-  }
+  for (Indices& column : pattern) std::sort(column.begin(), column.end());
+  const Indices first_in_column = first_entries(pattern);
   for (Pair& pair : pairs_)
     for (int i : groups_[pair.a].rows)
       for (int j : groups_[pair.b].rows) {
         const Indices& column = pattern[std::max(i, j)];
         const auto place = std::lower_bound(column.begin(), column.end(), std::min(i, j)) - column.begin();
-        pair.entries.push_back(first_entry[std::max(i, j)] + static_cast<int>(place));
+        pair.entries.push_back(first_in_column[std::max(i, j)] + static_cast<int>(place));
       }
-  row_entries_.resize(first_entry[count]);
+  row_entries_.resize(first_in_column.back());
   rows_ = std::make_unique<SparseElimination>(pattern, std::vector<Indices>(), Indices());
   operations_ = rows_->operations();
   inverse_pivots_.resize(tree.n);
@@ -111,7 +106,7 @@ bool ArticulatedElimination::compute(const std::vector<double>& J_entries) {
     for (int i = 0; i < rows; ++i)
       for (int j = 0; j < columns; ++j) row_entries_[pair.entries[i * columns + j]] = products[i][j];
   }
-  return rows_->compute(row_entries_, no_rows_);
+  return rows_->compute(row_entries_, {});
 }
 
 // x += L^-1 J^T lambda, with the multipliers lambda that change the accelerations of the rows by `rates`.

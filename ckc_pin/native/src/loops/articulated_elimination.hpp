@@ -65,7 +65,6 @@ class ArticulatedElimination {
   std::vector<Pair> pairs_;
   std::unique_ptr<SparseElimination> rows_;
   std::vector<double> row_entries_;  // of the upper triangle of J D'^-1 J^T, by column
-  std::vector<double> no_rows_;
   long visits_ = 0, operations_ = 0;
   std::vector<double> inverse_pivots_;  // of a pair's places
   Vector rates_, multipliers_;

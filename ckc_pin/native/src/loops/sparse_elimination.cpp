@@ -10,6 +10,12 @@ namespace ckc {
 // inertia of the whole chain there. Whether digits are lost that projection keeps is up to EliminationCheck.
 constexpr double min_pivot_ratio = 1e-6;
 
+Indices first_entries(const std::vector<Indices>& pattern) {
+  Indices first(1, 0);
+  for (const Indices& entries : pattern) first.push_back(first.back() + static_cast<int>(entries.size()));
+  return first;
+}
+
 SparseElimination::SparseElimination(const std::vector<Indices>& inertia_pattern,
                                      const std::vector<Indices>& row_pattern, Indices kept)
     : n_(static_cast<int>(inertia_pattern.size())), kept_(std::move(kept)) {
@@ -39,9 +45,7 @@ SparseElimination::SparseElimination(const std::vector<Indices>& inertia_pattern
   int source = 0;
   for (int j = 0; j < n_; ++j)
     for (int i : inertia_pattern[j]) inertia_entries_.push_back({value_of(i, j), source++, place_[i], place_[j], 0.0});
-  Indices first_in_row(1, 0);
-  for (const Indices& columns : row_pattern)
-    first_in_row.push_back(first_in_row.back() + static_cast<int>(columns.size()));
+  const Indices first_in_row = first_entries(row_pattern);
   for (int i = n_; i < size; ++i) {
     source = first_in_row[kept_[i - n_]];
     for (int j : row_pattern[kept_[i - n_]])

@@ -9,6 +9,9 @@
 
 namespace ckc {
 
+// Place of the first entry of each row (or column) of a pattern in a list of all entries, and their number.
+Indices first_entries(const std::vector<Indices>& pattern);
+
 class SparseElimination {
  public:
   // `inertia_pattern`: by coordinate j, the rows i <= j of D' that may be different from zero. `row_pattern`: by row of J,
