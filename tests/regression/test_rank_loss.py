@@ -54,6 +54,13 @@ def test_run_far_from_a_crossing_costs_no_extra_evaluations(rtol: float, rhs: in
         assert n_four_bar(N, rtol, t_end=0.6).stats["rhs"] <= rhs + 3  # for the interpolant
 
 
+def test_collocation_steps_stop_their_iteration_at_the_tolerance() -> None:
+    """A run has 11 crossings. Most of their steps take two sweeps of 10 stages for the guess, and two of all 14."""
+    counts = [n_four_bar(N, rtol).stats for N in (1, 2, 4) for rtol in (8e-8, 9e-8, 1e-7, 1.1e-7)]
+    rhs_of_crossings = [stats["rhs"] - 12 * (stats["steps"] + stats["rejected"]) for stats in counts]
+    assert np.mean(rhs_of_crossings) <= 11 * 54
+
+
 def test_coarse_run_is_repeated_when_crossings_were_missed() -> None:
     """At rtol = 1e-3, steps pass three losses of rank before the first is detected."""
     run = n_four_bar(4, 1e-3)

@@ -169,7 +169,8 @@ Matrix ranks(Loop& loop, MatrixArg states) {
 Vector collocate(Loop& loop, double span, int stages) {
   System& system = *loop.step_loop->system;
   const Step& now = loop.step_loop->now;
-  Collocation step(system, loop.step_loop->work, stages, std::max(stages - 2, 2));
+  const Tolerance tightest{0.0, 0.0, 0.0};
+  Collocation step(system, loop.step_loop->work, tightest, stages, std::max(stages - 2, 2));
   Vector y(system.size);
   step.make_step(now.t, now.y, span, false);
   step.evaluate(now.t + span, y);

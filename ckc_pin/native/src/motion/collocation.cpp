@@ -11,9 +11,9 @@ namespace ckc {
 // Accepted error of a polynomial of lower degree, and of the iteration, relative to |y|.
 constexpr double max_relative_error = 1e-9;
 constexpr int error_order = 12;  // observed order of the error in the step size
-// Tolerances of the fixed-point iteration on the stages: for the step itself, and for the step from which the initial
-// guess is extrapolated.
-constexpr double step_tolerance = 0.005 * max_relative_error, guess_tolerance = 1e-4;
+// Tolerances of the fixed-point iteration on the stages, relative to |y|: for the step itself the smaller of a part of
+// its accepted error and a part of rtol, and for the step from which the initial guess is extrapolated.
+constexpr double part_of_error = 0.1, part_of_rtol = 1e-3, guess_tolerance = 1e-4;
 constexpr int max_sweeps = 30;
 constexpr double run_up_fraction = 0.4;   // part of the step that is integrated first, as a guess for the rest
 constexpr double max_guess_error = 0.03;  // relative to |y|; with a larger error of the guess the step is rejected
@@ -30,8 +30,13 @@ Collocation::Table::Table(int s)
   integration_at_nodes = legendre_values(nodes, s + 1).transpose() * integration;
 }
 
-Collocation::Collocation(System& system, Work& work, int stages, int run_up_stages)
-    : system_(system), work_(work), table_(stages), run_up_(run_up_stages), is_integrated_twice_(system.size, false) {
+Collocation::Collocation(System& system, Work& work, const Tolerance& tolerance, int stages, int run_up_stages)
+    : system_(system),
+      work_(work),
+      tolerance_(tolerance),
+      table_(stages),
+      run_up_(run_up_stages),
+      is_integrated_twice_(system.size, false) {
   const Vector points = Vector::LinSpaced(points_of_rest, -1.0, 1.0);
   rest_at_points_ = legendre_values(points, stages + 1).bottomRows(stages - run_up_stages).transpose();
   state_.setZero(system.size), rate_.setZero(system.size);
@@ -60,10 +65,11 @@ void Collocation::make_step(double t_, In y, double span, bool is_repeat) {
   if (!is_repeat) {
     if (!evaluate_rate(t_old, y_, rate_)) rate_.setConstant(std::nan(""));
     guess_ = rate_.transpose().replicate(run_up_.nodes.size(), 1);
-    solve_stages(run_up_, length, guess_tolerance, infinity);
+    solve_stages(run_up_, length, guess_tolerance * size, infinity);
   }
   extrapolate_guess(length, span / length);
-  const double guess_error = solve_stages(table_, span, step_tolerance, max_guess_error * size);
+  const double step_tolerance = std::min(part_of_error * max_relative_error, part_of_rtol * tolerance_.rtol),
+               guess_error = solve_stages(table_, span, step_tolerance * size, max_guess_error * size);
   if (!(guess_error <= max_guess_error * size)) {
     error = std::isfinite(guess_error) ? predicted_error_factor * guess_error / size : infinity;
     return;
@@ -78,9 +84,8 @@ double Collocation::solve_stages(const Table& table, double span, double toleran
   double guess_error = std::nan(""), previous_change = infinity, contraction = 1.0;
   const auto pairs = static_cast<Eigen::Index>(rate_pairs_.size());
   rate_corrections_.setZero(table.nodes.size(), pairs);
-  for (int sweep = 0; sweep < max_sweeps; ++sweep) {
-    integrate(table, span);
-    if (!states_.allFinite()) break;
+  integrate(table, span);
+  for (int sweep = 0; sweep < max_sweeps && states_.allFinite(); ++sweep) {
     evaluate_rates(table.nodes, span);
     const double sweep_change = largest_entry(rates_ - guess_) * span;
     if (sweep == 0) guess_error = sweep_change;
@@ -88,14 +93,14 @@ double Collocation::solve_stages(const Table& table, double span, double toleran
     guess_ = rates_;
     for (Eigen::Index k = 0; k < pairs; ++k)
       rate_corrections_.col(k) = rates_.col(rate_pairs_[k].first) - states_.col(rate_pairs_[k].second);
-    // The iteration diverges, or has converged to rounding.
-    if (!(sweep_change < 0.5 * previous_change) || guess_error > max_first_change) break;
-    if (sweep_change * contraction <= tolerance) break;
+    last_states_ = states_;
+    integrate(table, span);
+    iteration_error_ = contraction * largest_entry(states_ - last_states_);
+    // The iteration has converged, diverges, or has converged to rounding.
+    if (iteration_error_ <= tolerance || !(sweep_change < 0.5 * previous_change) || guess_error > max_first_change)
+      break;
     previous_change = sweep_change;
   }
-  last_states_ = states_;
-  integrate(table, span);
-  iteration_error_ = contraction * largest_entry(states_ - last_states_);
   series_.noalias() = (0.5 * span) * table.integration * guess_;
   series_.row(0) += y_.transpose();
   return guess_error;

@@ -13,7 +13,7 @@ class Collocation : public Interpolant {
  public:
   // Numbers of stages are even: an odd one has a stage in the middle, at the singular position. The step is accurate if
   // a polynomial of degree `run_up_stages` would do.
-  Collocation(System& system, Work& work, int stages = 14, int run_up_stages = 10);
+  Collocation(System& system, Work& work, const Tolerance& tolerance, int stages = 14, int run_up_stages = 10);
 
   // Step from (t, y) over a span whose middle is the singular position. `is_repeat`: the last step had the same start
   // and about the same span, so that it is the initial guess.
@@ -47,6 +47,7 @@ class Collocation : public Interpolant {
 
   System& system_;
   Work& work_;
+  const Tolerance& tolerance_;
   const Table table_, run_up_;
   Matrix rest_at_points_;  // from the terms of a series of degree more than `run_up_stages` to their sum at points
   std::vector<std::pair<int, int>> rate_pairs_;  // entries of y of which the second is the rate of the first

@@ -17,8 +17,8 @@ constexpr double min_retry_fraction = 1e-9;
 constexpr double min_bounce_rise = 1e-10;
 constexpr double infinity = std::numeric_limits<double>::infinity();
 
-static std::unique_ptr<Collocation> collocation_of(System& system, Work& work) {
-  return system.crosses_singularities ? std::make_unique<Collocation>(system, work) : nullptr;
+static std::unique_ptr<Collocation> collocation_of(System& system, Work& work, const Tolerance& tolerance) {
+  return system.crosses_singularities ? std::make_unique<Collocation>(system, work, tolerance) : nullptr;
 }
 
 // Return the system with the integrand appended. Members that are constructed later need its full size.
@@ -40,7 +40,7 @@ StepLoop::StepLoop(std::unique_ptr<Control> control_, std::unique_ptr<System> sy
       rk45_(Explicit::rk45, *system, now, work, tolerance_),
       monitor_(system->core),
       energy_(system->core),
-      crossing_(*system, method_, now, monitor_, collocation_of(*system, work), options_.manifold_tolerance),
+      crossing_(*system, method_, now, monitor_, collocation_of(*system, work, tolerance_), options_.manifold_tolerance),
       joint_transitions_(*system, std::max(options_.atol, min_bounce_rise), tolerance_) {
   for (Vector* x : {&now.y, &now.f, &now.y_new, &now.f_new, &now.y_old, &y_out_, &y_present_}) x->setZero(system->size);
 }
