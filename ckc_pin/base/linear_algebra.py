@@ -171,7 +171,7 @@ def _solve_columns(solve: Callable[[Array], Array], right: Array, rows: int) -> 
     return x
 
 
-def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, Array]:
+def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, bool]:
     """Return a basis of the null space of J and a particular solution of J x = -residual, by a pivoted QR of J.
 
     The basis vectors have exact ones and zeros in the columns that the pivoting did not choose. An orthonormal basis
@@ -192,15 +192,19 @@ def null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Arra
         Basis of the null space; no entry is much larger than 1.
     particular : (n,) array, or (n, k)
         A solution of J x = -residual that is zero in the same columns.
-    pivots : (rank,) array
-        Absolute values of the diagonal of R, decreasing.
+    has_rank : bool
+        False if the smallest pivot is at most `MIN_PIVOT` times the largest.
     """
     tangent, particular, pivots, _ = _null_space(jacobian, rank, residual)
-    return tangent, particular, pivots
+    return tangent, particular, _has_rank(pivots)
+
+
+def _has_rank(pivots: Array) -> bool:
+    return not len(pivots) or bool(pivots[-1] > MIN_PIVOT * pivots[0])
 
 
 def _null_space(jacobian: Array, rank: int, residual: Array) -> tuple[Array, Array, Array, IntArray]:
-    """Return what `null_space` returns, and the columns (rank,) that the pivoting chose."""
+    """Return basis and solution of `null_space`, the pivots (rank,), decreasing, and the columns that they chose."""
     n = jacobian.shape[1]
     tangent, particular = np.zeros((n, n - rank)), np.zeros((n, *residual.shape[1:]))
     order, pivots = pivoted_columns(jacobian)
@@ -227,14 +231,13 @@ def null_spaces(jacobians: Array, rank: int) -> tuple[Array, BoolArray]:
     -------
     bases : (count, n, n - rank) array
     has_rank : (count,) array of bool
-        False if the smallest pivot is at most `MIN_PIVOT` times the largest.
     """
     count, rows, n = jacobians.shape
     bases, has_rank, active = np.empty((count, n, n - rank)), np.ones(count, bool), np.arange(count)
     while len(active):
         first, active = active[0], active[1:]
         bases[first], _, pivots, chosen = _null_space(jacobians[first], rank, np.zeros(rows))
-        has_rank[first] = not rank or pivots[-1] > MIN_PIVOT * pivots[0]
+        has_rank[first] = _has_rank(pivots)
         if not len(active) or not has_rank[first]:
             continue
         remaining = np.setdiff1d(np.arange(n), chosen)

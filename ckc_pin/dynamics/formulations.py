@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ckc_pin.base.arrays import Array, IntArray
-from ckc_pin.base.linear_algebra import MIN_PIVOT, Factorization, null_space
+from ckc_pin.base.linear_algebra import Factorization, null_space
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.mechanism.configuration import Kinematics
@@ -102,9 +102,8 @@ def tangent_basis(terms: Terms, residual: Array) -> tuple[Array, Array]:
     NumericalError
         J has lost rank.
     """
-    mechanism = terms.mechanism
-    tangent, particular, pivots = null_space(terms.at.J, mechanism.rank, residual)
-    if mechanism.rank and not pivots[-1] > MIN_PIVOT * pivots[0]:
+    tangent, particular, has_rank = null_space(terms.at.J, terms.mechanism.rank, residual)
+    if not has_rank:
         raise rank_loss_error(terms)
     return tangent, particular
 

@@ -33,7 +33,7 @@ from ckc_pin.mechanism.warnings import describe_stop_violation
 from ckc_pin.native.control import apply_u
 from ckc_pin.native.plant import NONE
 from ckc_pin.run.compiled_terms import select_library
-from ckc_pin.run.inverse import RecordedJoints
+from ckc_pin.run.recorded import RecordedJoints
 from ckc_pin.run.run import Run
 from ckc_pin.run.simulate import simulate
 from ckc_pin.scene.initial import find_start

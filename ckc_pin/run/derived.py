@@ -116,7 +116,7 @@ class RunQuantities(DerivedQuantities):
 
     @cached_property
     def _dynamics(self) -> tuple[Array, Array]:
-        from ckc_pin.run.inverse import compute_recorded_dynamics  # which uses runs
+        from ckc_pin.run.recorded import compute_recorded_dynamics  # which uses runs
 
         return compute_recorded_dynamics(self._run)
 

@@ -1,24 +1,20 @@
 """Inverse dynamics: motor torques, loop forces and joint forces along a prescribed or a recorded motion.
 
-For a recorded run, eq. 1 gives the accelerations from the recorded motor torques at each output instant. The result
-therefore contains these torques, and nothing is interpolated between output instants. The run's events tell which
-joints slid, stuck and touched stops.
+For a recorded run, the result contains the torques of the run, since its accelerations follow from them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from dataclasses import dataclass
 from os.path import isfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ckc_pin.base.arrays import Array, IntArray
+from ckc_pin.base.arrays import Array
 from ckc_pin.base.interrupt import acknowledge
-from ckc_pin.base.linear_algebra import Factorization, null_spaces, one_blas_thread
+from ckc_pin.base.linear_algebra import null_spaces, one_blas_thread
 from ckc_pin.base.sources import Sources
 from ckc_pin.base.validation import require_callable, require_table
 from ckc_pin.control.actuation import Actuation
@@ -27,13 +23,14 @@ from ckc_pin.control.desired import Desired, find_rate_jump
 from ckc_pin.control.forces import body_wrenches, generalized_force
 from ckc_pin.control.joint_servo import JointServo
 from ckc_pin.control.workspace import find_workspace_exit
-from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, rank_loss_error, tangent_basis, tree_force
+from ckc_pin.dynamics.formulations import multipliers, rank_loss_error, tree_force
 from ckc_pin.dynamics.inverse import friction_force, joint_wrenches_along, loop_wrenches_along
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
 from ckc_pin.kinematics.sigma import sigma
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.motion_forces import MotionForces, collect_forces
+from ckc_pin.run.recorded import Instant, recorded_motion
 from ckc_pin.run.run import Run, Status
 from ckc_pin.scene.initial import find_start
 from ckc_pin.scene.overrides import EXPECTED_OVERRIDES, apply_overrides
@@ -45,7 +42,7 @@ from ckc_pin.scene.parts import (
 )
 from ckc_pin.scene.scene import Scene, as_scene, make_scene
 
-__all__ = ["RecordedJoints", "compute_loop_forces", "compute_recorded_dynamics", "inverse_dynamics"]
+__all__ = ["inverse_dynamics"]
 
 # Below this, relative to the forces along a freedom, a missing generalized force is rounding.
 FORCE_TOLERANCE = 1e-7
@@ -53,37 +50,8 @@ FORCE_TOLERANCE = 1e-7
 CROSS_TOLERANCE = 1e-4
 # A motor at a dead centre moves by less than this, relative to the motion of the freedom.
 DEAD_CENTRE_TOLERANCE = 1e-7
-# Singular values below this, relative to the largest, belong to joints whose holding forces depend on those of others.
-HOLDING_RANK_TOLERANCE = 1e-9
 MAX_BATCH = 64  # instants whose forces are computed together
 MAX_BATCH_ENTRIES = 65_536  # of their matrices (n, n), which stay in the cache
-
-
-@dataclass(frozen=True)
-class _Instant:
-    """One instant of a motion.
-
-    Attributes
-    ----------
-    t : float
-        s.
-    terms : Terms
-    acceleration : (n,) array
-        Acceleration of the tree.
-    tau : (motors,) array
-        Recorded torques or preload; inverse dynamics adds the minimum-norm torques that are missing.
-    other_force : (n,) array
-        Generalized force of friction, stops and forces on links.
-    link_wrenches : (joints, 6) array
-        Wrenches of forces on links, see `body_wrenches`.
-    """
-
-    t: float
-    terms: Terms
-    acceleration: Array
-    tau: Array
-    other_force: Array
-    link_wrenches: Array
 
 
 def inverse_dynamics(
@@ -137,7 +105,7 @@ def inverse_dynamics(
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
             actuation = build_scene_actuation(scene, mechanism)
-            motion, t_end = _recorded_motion(what, mechanism), float(what.t[-1])
+            motion, t_end = recorded_motion(what, mechanism), float(what.t[-1])
         else:
             scene = what
             mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end
@@ -165,7 +133,7 @@ def _scene_of(run: Run, overrides: Mapping[str, Any]) -> Scene:
 
 
 def _collect_motion(
-    motion: Iterator[_Instant],
+    motion: Iterator[Instant],
     mechanism: Mechanism,
     actuation: Actuation,
     name: str,
@@ -191,11 +159,11 @@ def _collect_motion(
 
 
 def _split_into_batches(
-    motion: Iterator[_Instant], n: int, t_end: float, progress: Callable[[float, float], None] | None
-) -> Iterator[list[_Instant]]:
+    motion: Iterator[Instant], n: int, t_end: float, progress: Callable[[float, float], None] | None
+) -> Iterator[list[Instant]]:
     """Yield the instants of a motion in batches. If the motion fails, the instants before come first."""
     size = max(1, min(MAX_BATCH, MAX_BATCH_ENTRIES // n**2))
-    batch: list[_Instant] = []
+    batch: list[Instant] = []
     try:
         for instant in motion:
             batch.append(instant)
@@ -215,7 +183,7 @@ def _split_into_batches(
 
 
 def _append_forces(
-    forces: list[dict[str, Any]], batch: list[_Instant], mechanism: Mechanism, actuation: Actuation
+    forces: list[dict[str, Any]], batch: list[Instant], mechanism: Mechanism, actuation: Actuation
 ) -> None:
     """Solve eq. 1 at instants for tau and the multipliers, and append them with the joint wrenches that follow.
 
@@ -277,7 +245,7 @@ def _motor_motions(mechanism: Mechanism, tangent: Array) -> tuple[Array, Array]:
     return values, motions @ directions
 
 
-def _explain_failure(instant: _Instant, mechanism: Mechanism, required: Array, tangent: Array | None) -> NumericalError:
+def _explain_failure(instant: Instant, mechanism: Mechanism, required: Array, tangent: Array | None) -> NumericalError:
     """Return the error that tells why the motors cannot provide a required force (n,).
 
     The motion is not finite, J has lost rank (`tangent` is None), or no motor moves some freedom, for example at a
@@ -293,10 +261,10 @@ def _explain_failure(instant: _Instant, mechanism: Mechanism, required: Array, t
     return NumericalError(f"the motion along {coordinate} is held by no actuator at t = {t:.6g} s", t=t)
 
 
-# --- motions -------------------------------------------------------------------------------------
+# --- desired motions -----------------------------------------------------------------------------
 
 
-def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[_Instant]:
+def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) -> Iterator[Instant]:
     """Yield the desired motion of a scene's controller, with v' = rho q_dot and its rate rho q_ddot + rho_dot q_dot."""
     controller = build_scene_controller(scene, mechanism)
     if not isinstance(controller, SetPoint | Tracking):
@@ -333,140 +301,10 @@ def _desired_motion(scene: Scene, mechanism: Mechanism, actuation: Actuation) ->
         acceleration = at.rho @ q_d_ddot + terms.rho_dot_times(q_d_dot)
         wrenches = body_wrenches(forces, t, terms)
         other_force = friction_force(mechanism, terms.v_tree) + generalized_force(wrenches, terms)
-        yield _Instant(t, terms, acceleration, actuation.preload, other_force, wrenches)
+        yield Instant(t, terms, acceleration, actuation.preload, other_force, wrenches)
 
 
 def _rest_at(q_d: Array) -> Desired:
     """Return the motion that stays at q_d."""
     zero = np.zeros_like(q_d)
     return lambda t: (q_d, zero, zero)
-
-
-def _recorded_motion(run: Run, mechanism: Mechanism) -> Iterator[_Instant]:
-    """Yield the motion that a run recorded."""
-    if np.any(run.w[0]):
-        raise InputError(
-            f"{run.scene_name}: the run starts off phi = 0, with open loops; no forces in a closed mechanism produce "
-            "its motion"
-        )
-    record = _Record(run, mechanism)
-    for k in range(len(run.t)):
-        yield record.instant(k)
-
-
-class _Record:
-    """The instants of a run, with its accelerations by eq. 1."""
-
-    def __init__(self, run: Run, mechanism: Mechanism) -> None:
-        self.run, self.mechanism = run, mechanism
-        self.joints = RecordedJoints(run)
-
-    def instant(self, k: int) -> _Instant:
-        """Return the instant of a row (NumericalError if J has lost rank there)."""
-        run, mechanism, t = self.run, self.mechanism, float(self.run.t[k])
-        at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
-        terms = Terms(mechanism, at, run.v_tree[k])
-        wrenches = body_wrenches(run.forces_at(k), t, terms)
-        u_tree, other_force = mechanism.motors.force(run.tau[k]), generalized_force(wrenches, terms)
-        correction = np.zeros(mechanism.closure.rows)
-        if mechanism.prescribed:  # their motors overcome their friction
-            accelerations, _ = run.prescribed_at(k)
-            correction[mechanism.prescribed_rows] = -accelerations
-            if self.joints.smoothing is None:
-                at_joints = mechanism.prescribed_at
-                other_force[at_joints] -= mechanism.joints.friction[at_joints] * np.sign(run.v_tree[k, at_joints])
-        other_force += self.joints.force(k, terms, u_tree + other_force, correction)
-        acceleration = dae_acceleration(terms, u_tree + other_force, correction)
-        return _Instant(t, terms, acceleration, run.tau[k], other_force, wrenches)
-
-
-# --- joints of recorded runs ---------------------------------------------------------------------
-
-
-class RecordedJoints:
-    """Generalized forces of dry friction and stops along a run, reconstructed from the run's events.
-
-    Parameters
-    ----------
-    run : Run
-    """
-
-    def __init__(self, run: Run) -> None:
-        mechanism = self.mechanism = run.mechanism
-        self.smoothing = run.scene.get("friction_smoothing")
-        sign, locked = np.zeros(mechanism.n), np.zeros(mechanism.n, dtype=bool)
-        transitions = [event for event in run.events if event["of"] in ("friction", "stop")]
-        self.sliding_signs: list[Array] = []
-        self.locked: list[IntArray] = []
-        for t in run.t:
-            while transitions and transitions[0]["t"] <= t:
-                event = transitions.pop(0)
-                k, transition = mechanism.tree.index[event["coordinate"]], event["name"].rpartition(" ")[2]
-                locked[k] = transition in ("sticks", "touches")
-                sign[k] = event["direction"] if transition == "slides" else 0.0 if locked[k] else sign[k]
-            self.sliding_signs.append(sign.copy())
-            self.locked.append(np.flatnonzero(locked))
-
-    def force(self, k: int, terms: Terms, u_tree: Array, correction: Array | float = 0.0) -> Array:
-        """Return the force of friction and stops on the tree at output instant k, shape (n,), N or N m.
-
-        Joints that stick or touch a stop have the minimum-norm forces that keep them at rest.
-
-        Parameters
-        ----------
-        k : int
-        terms : Terms
-            At the instant.
-        u_tree : (n,) array
-            All other applied forces u'.
-        correction : (rows,) array, optional
-            Minus the acceleration of the constraint rows.
-        """
-        joints = self.mechanism.joints
-        if self.smoothing is not None:
-            return joints.smooth_friction(terms.v_tree, self.smoothing)
-        force = -joints.friction * self.sliding_signs[k]
-        locked = self.locked[k]
-        if not len(locked):
-            return force
-        tangent, _ = tangent_basis(terms, np.zeros(self.mechanism.closure.rows))
-        inertia = Factorization(tangent.T @ terms.D_tree @ tangent)
-        locked_tangent = tangent[locked]
-        responses = locked_tangent @ np.column_stack([inertia.solve(row) for row in locked_tangent])
-        acceleration = dae_acceleration(terms, u_tree + force, correction)[locked]
-        force[locked] -= np.linalg.lstsq(responses, acceleration, rcond=HOLDING_RANK_TOLERANCE)[0]
-        return force
-
-
-def compute_loop_forces(run: Run) -> dict[str, Array]:
-    """Return the multipliers of eq. 1 along a run by loop; see `Run.loop_forces`."""
-    _, forces = compute_recorded_dynamics(run)
-    loops = [loop for loop, _ in run.mechanism.closure.names]
-    return {loop: forces[:, [name == loop for name in loops]] for loop in dict.fromkeys(loops)}
-
-
-def compute_recorded_dynamics(run: Run) -> tuple[Array, Array]:
-    """Return the accelerations of the tree and the multipliers of eq. 1 at a run's output instants.
-
-    They follow from the recorded state and motor torques, and from the friction and stops of the run's events.
-
-    Parameters
-    ----------
-    run : Run
-
-    Returns
-    -------
-    a_tree : (m, n) array
-        Time derivative of v'.
-    multipliers : (m, rows) array
-        Both are NaN where J has lost rank.
-    """
-    record = _Record(run, run.mechanism)
-    accelerations, forces = np.full_like(run.v_tree, np.nan), np.full_like(run.phi, np.nan)
-    for k in range(len(run.t)):
-        with suppress(NumericalError):
-            instant = record.instant(k)
-            u_tree = run.mechanism.motors.force(instant.tau) + instant.other_force
-            forces[k] = multipliers(instant.terms, u_tree, instant.acceleration)
-            accelerations[k] = instant.acceleration
-    return accelerations, forces

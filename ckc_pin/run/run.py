@@ -469,7 +469,7 @@ class Run(HasSummary):
         The multiplier of a point row is the force that the loop exerts on frame A along the row's axis. NaN is returned
         where J has lost rank, because the multipliers are not determined there.
         """
-        from ckc_pin.run.inverse import compute_loop_forces
+        from ckc_pin.run.recorded import compute_loop_forces
 
         return compute_loop_forces(self)
 

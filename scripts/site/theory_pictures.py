@@ -12,7 +12,7 @@ import numpy as np
 
 import ckc_pin
 from ckc_pin.mechanism.library import library
-from ckc_pin.run.inverse import RecordedJoints
+from ckc_pin.run.recorded import RecordedJoints
 from ckc_pin.view import style
 from ckc_pin.view.layout import legend_line, set_panel_title
 from ckc_pin.view.style import figure_style

@@ -176,7 +176,7 @@ def test_every_name_denotes_one_number_for_each_instant(name: str) -> None:
 def test_nothing_is_computed_that_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     run = simulate("five_bar/swing", {"t_end": 0.05})
     monkeypatch.setattr("ckc_pin.run.derived.Terms", None)
-    monkeypatch.setattr("ckc_pin.run.inverse.Terms", None)
+    monkeypatch.setattr("ckc_pin.run.recorded.Terms", None)
     for name in ("v.theta_2", "u.theta_1", "tip.x", "tip.v.x", "energy.total", "phi.max"):
         assert np.isfinite(run[name]).all()
     with pytest.raises(TypeError):

@@ -14,48 +14,47 @@ constexpr double min_pivot_ratio = 1e-6;
 
 namespace {
 
-#define INLINE inline __attribute__((always_inline))
 
 using Spatial = ArticulatedBodies::Spatial;
 using SpatialInertia = ArticulatedBodies::SpatialInertia;
 using Coordinate = ArticulatedBodies::Coordinate;
 using Motion = ArticulatedBodies::Motion;
 
-INLINE Vector8& vector_of(double* x) { return *reinterpret_cast<Vector8*>(x); }
-INLINE const Vector8& vector_of(const double* x) { return *reinterpret_cast<const Vector8*>(x); }
+ALWAYS_INLINE Vector8& vector_of(double* x) { return *reinterpret_cast<Vector8*>(x); }
+ALWAYS_INLINE const Vector8& vector_of(const double* x) { return *reinterpret_cast<const Vector8*>(x); }
 
 // Template arguments lose the attribute that Vector8 need not be aligned.
 typedef double Aligned8 __attribute__((vector_size(8 * sizeof(double))));
-INLINE void read(const double* x, size_t k, double& value) { value = x[k]; }
-INLINE void read(const double* x, size_t k, Aligned8& value) { value = vector_of(x + 8 * k); }
-INLINE void write(const double& value, size_t k, double* x) { x[k] = value; }
-INLINE void write(const Aligned8& value, size_t k, double* x) { vector_of(x + 8 * k) = value; }
+ALWAYS_INLINE void read(const double* x, size_t k, double& value) { value = x[k]; }
+ALWAYS_INLINE void read(const double* x, size_t k, Aligned8& value) { value = vector_of(x + 8 * k); }
+ALWAYS_INLINE void write(const double& value, size_t k, double* x) { x[k] = value; }
+ALWAYS_INLINE void write(const Aligned8& value, size_t k, double* x) { vector_of(x + 8 * k) = value; }
 
 constexpr int entry[6] = {0, 1, 2, 4, 5, 6};  // of a Spatial
 
-INLINE double sum(const double (&terms)[6]) {
+ALWAYS_INLINE double sum(const double (&terms)[6]) {
   return ((terms[0] + terms[1]) + (terms[2] + terms[3])) + (terms[4] + terms[5]);
 }
 
-INLINE double dot(const Spatial& a, const Spatial& b) {
+ALWAYS_INLINE double dot(const Spatial& a, const Spatial& b) {
   double products[6];
   for (int c = 0; c < 6; ++c) products[c] = a.x[entry[c]] * b.x[entry[c]];
   return sum(products);
 }
 
-INLINE Vector3 linear(const Spatial& of) { return {of.x[0], of.x[1], of.x[2]}; }
-INLINE Vector3 angular(const Spatial& of) { return {of.x[4], of.x[5], of.x[6]}; }
-INLINE Spatial spatial(const Vector3& linear, const Vector3& angular) {
+ALWAYS_INLINE Vector3 linear(const Spatial& of) { return {of.x[0], of.x[1], of.x[2]}; }
+ALWAYS_INLINE Vector3 angular(const Spatial& of) { return {of.x[4], of.x[5], of.x[6]}; }
+ALWAYS_INLINE Spatial spatial(const Vector3& linear, const Vector3& angular) {
   return {{linear.x(), linear.y(), linear.z(), 0.0, angular.x(), angular.y(), angular.z(), 0.0}};
 }
 
 // Twice the kinetic energy of a motion.
-INLINE double inertia_along(const RigidBody& body, const Spatial& motion) {
+ALWAYS_INLINE double inertia_along(const RigidBody& body, const Spatial& motion) {
   const Vector3 velocity = linear(motion), omega = angular(motion);
   return velocity.dot(momentum(body, velocity, omega)) + omega.dot(angular_momentum(body, velocity, omega));
 }
 
-INLINE void add(const RigidBody& body, SpatialInertia& sum) {
+ALWAYS_INLINE void add(const RigidBody& body, SpatialInertia& sum) {
   const double* const m = body.moment;
   const double(*const i)[4] = body.inertia;
   const Vector8 columns[6] = {{body.mass, 0, 0, 0, 0, m[2], -m[1], 0}, {0, body.mass, 0, 0, -m[2], 0, m[0], 0},
@@ -96,18 +95,18 @@ WITH_WIDEST_REGISTERS bool factorize_bodies(std::vector<Coordinate>& coordinates
 
 // Product of a vector with the columns of six rows of numbers, or of eight numbers each.
 template <class T>
-INLINE void multiply_rows(const Spatial& vector, const T* rows, T& product) {
+ALWAYS_INLINE void multiply_rows(const Spatial& vector, const T* rows, T& product) {
   const double* const x = vector.x;
   product = ((rows[0] * x[0] + rows[1] * x[1]) + (rows[2] * x[2] + rows[3] * x[4])) + (rows[4] * x[5] + rows[5] * x[6]);
 }
 
 template <class T>
-INLINE void add_rows(const Spatial& vector, const T& factor, T* rows) {
+ALWAYS_INLINE void add_rows(const Spatial& vector, const T& factor, T* rows) {
   for (int c = 0; c < 6; ++c) rows[c] += factor * vector.x[entry[c]];
 }
 
 template <class T>
-INLINE void sweep_to_roots(const std::vector<Coordinate>& coordinates, const Indices& chosen, T* carried, double* x) {
+ALWAYS_INLINE void sweep_to_roots(const std::vector<Coordinate>& coordinates, const Indices& chosen, T* carried, double* x) {
   for (int k : chosen)
     for (int c = 0; c < 6; ++c) carried[6 * coordinates[k].joint + c] = T{};
   for (auto i = static_cast<int>(chosen.size()) - 1; i >= 0; --i) {
@@ -126,7 +125,7 @@ INLINE void sweep_to_roots(const std::vector<Coordinate>& coordinates, const Ind
 }
 
 template <class T>
-INLINE void sweep_to_leaves(const std::vector<Coordinate>& coordinates, T* carried, const double* x, double* a) {
+ALWAYS_INLINE void sweep_to_leaves(const std::vector<Coordinate>& coordinates, T* carried, const double* x, double* a) {
   for (int c = 0; c < 6; ++c) carried[c] = T{};  // the world's motion
   for (size_t k = 0; k < coordinates.size(); ++k) {
     const Coordinate& at = coordinates[k];
