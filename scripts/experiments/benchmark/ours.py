@@ -13,7 +13,7 @@ from scripts.experiments.benchmark.work import Work
 __all__ = ["PROGRAM", "compute", "name_of", "setting_of", "settings", "used_up"]
 
 PROGRAM = "ckc_pin"
-TOLERANCES = tuple(10.0**-k for k in range(3, 13))
+TOLERANCES = tuple(10.0**-k for k in range(3, 14))
 QUICK_TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 COARSE_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)  # for methods that are not the fastest
 METHODS = {"auto": TOLERANCES, "DOP853": TOLERANCES, "RK45": COARSE_TOLERANCES, "Radau": COARSE_TOLERANCES}
