@@ -48,7 +48,7 @@ class Analysis:
 
     def best(self, work: str) -> pd.DataFrame:
         """Return each program's fastest run to each accuracy of a work, ckc_pin's first."""
-        runs = fastest(self.rows[self.rows.work == work], ["program"], beyond_reference=True)
+        runs = fastest(self.rows[self.rows.work == work], ["program"])
         return runs.assign(other=runs.program != PROGRAM).sort_values(["target", "other"], ascending=[False, True])
 
     def against(self, kind: str) -> pd.DataFrame:
@@ -124,10 +124,8 @@ def analyse(
     return Analysis(rows.assign(kind=rows.program.map(kinds)), works.set_index("work"), checks, growth, left_out)
 
 
-def fastest(
-    rows: pd.DataFrame, by: Sequence[str], targets: Sequence[float] = TARGETS, *, beyond_reference: bool = False
-) -> pd.DataFrame:
-    """Return the fastest run of each group whose error stays within an accuracy, for each accuracy.
+def fastest(rows: pd.DataFrame, by: Sequence[str], targets: Sequence[float] = TARGETS) -> pd.DataFrame:
+    """Return the fastest run of each group whose error stays within an accuracy, for each that the reference tells.
 
     Parameters
     ----------
@@ -135,11 +133,9 @@ def fastest(
     by : sequence of str
         Columns that define the groups.
     targets : sequence of float
-    untold : bool
-        Also include accuracies below that of the reference.
     """
     done = rows[(rows.status == "done") & rows.error_max.notna()].merge(pd.DataFrame({"target": targets}), how="cross")
-    good = done[(done.error_max <= done.target) & (beyond_reference | (done.accuracy <= done.target))]
+    good = done[(done.error_max <= done.target) & (done.accuracy <= done.target)]
     return good.loc[good.groupby([*by, "target"], sort=False).wall_s.idxmin()]
 
 
