@@ -13,6 +13,9 @@ constexpr double max_time_past_end = 0.3, max_centre_error = 0.04, newton_time_t
 // Singular value at an expected crossing, relative to the present one, above which it is no crossing.
 constexpr double max_remaining_singular_value = 0.01;
 constexpr double look_ahead_steps = 4.0;  // number of steps within which crossings are expected
+// Where a run that cannot cross a position ends, relative to the distance from which it was first seen, and the part of
+// the distance that one step covers.
+constexpr double end_of_approach = 0.1, approach_fraction = 0.9;
 constexpr int max_attempts = 6, max_newton_steps = 10, manifold_checks = 9;
 // Bits of accuracy in the search for the smallest singular value, ahead of the step and within it.
 constexpr int ahead_search_bits = 8, step_search_bits = 24;
@@ -32,6 +35,7 @@ Crossing::Crossing(System& system, Method*& method, Step& step, RankMonitor& mon
 
 void Crossing::reset() {
   crossing_in_rejected_step_ = not_found, max_distance_ = std::numeric_limits<double>::infinity(), attempts_ = 0;
+  blocking_.reset();
 }
 
 bool Crossing::may_pass() const { return collocation && attempts_ < max_attempts; }
@@ -71,7 +75,7 @@ Crossing::Verdict Crossing::judge_step(const Rank& end, const Rank& after) {
     const RankMonitor::Minimum minimum =
         monitor_.find_minimum(system_.core, set_interpolated, step_.t, step_.t_new, step_search_bits);
     if (minimum.value < rank_lost) {
-      if (!may_pass()) return {0.0, true, minimum.t, minimum.value};
+      if (!may_pass()) return approach(minimum.t, minimum.value);
       crossing_in_rejected_step_ = minimum.t;
       return {0.5 * (minimum.t - step_.t) / h};
     }
@@ -79,11 +83,20 @@ Crossing::Verdict Crossing::judge_step(const Rank& end, const Rank& after) {
     if (resolved_fraction < 1.0 || RankMonitor::has_rank(after)) return {resolved_fraction};
   }
   if (!RankMonitor::has_rank(after) && !(fraction < 1.0)) {
-    if (!may_pass()) return {0.0, true, step_.t_new, after.value};
+    if (!may_pass()) return approach(step_.t_new, after.value);
     crossing_in_rejected_step_ = step_.t_new;
     return {0.5};
   }
   return {std::isnan(fraction) ? 1.0 : fraction};
+}
+
+// Shorten the step so that it ends before a position that cannot be passed, or end the run if that is near.
+Crossing::Verdict Crossing::approach(double t, double value) {
+  const double distance = t - step_.t,
+               closest_approach = blocking_ ? blocking_->closest_approach : end_of_approach * distance;
+  blocking_ = {t, value, closest_approach};
+  if (distance <= closest_approach) return {0.0, true, t, value};
+  return {approach_fraction * distance / (step_.t_new - step_.t)};
 }
 
 double Crossing::step_over(double time_left, double step_size) {

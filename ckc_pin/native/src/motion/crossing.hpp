@@ -3,6 +3,7 @@
 #pragma once
 
 #include <memory>
+#include <optional>
 
 #include "motion/collocation.hpp"
 #include "motion/rank_monitor.hpp"
@@ -36,8 +37,15 @@ class Crossing {
   double step_over(double time_left, double step_size);
   // Call after a step is accepted.
   void accept_step(const Rank& after) {
-    if (after.rate > 0.0) attempts_ = 0;
+    if (after.rate > 0.0) attempts_ = 0, blocking_.reset();
   }
+
+  // A position ahead that cannot be passed.
+  struct Blocking {
+    double t, value;          // time, smallest singular value
+    double closest_approach;  // s; the run ends this near to it
+  };
+  const std::optional<Blocking>& blocking() const { return blocking_; }
 
   const std::unique_ptr<Collocation> collocation;
 
@@ -48,6 +56,7 @@ class Crossing {
   double find_zero(const Motion& motion, double t, double accuracy);
   bool is_on_manifold();
   bool may_pass() const;
+  Verdict approach(double t, double value);
 
   System& system_;
   Method*& method_;
@@ -56,6 +65,7 @@ class Crossing {
   double manifold_tolerance_;
   double crossing_in_rejected_step_;  // NaN if there is none
   double max_distance_;               // s; collocation steps from farther away are not expected to be accurate
+  std::optional<Blocking> blocking_;
   int attempts_ = 0;
   Vector y_;
 };

@@ -227,6 +227,12 @@ std::optional<Stop> StepLoop::prepare_step(double bound) {
   return {};
 }
 
+// Whether a run may stop so shortly before a position where J loses rank: the equations are ill-conditioned there.
+static bool may_follow_from_rank_loss(Stop::Reason reason) {
+  return reason == Stop::coordinates_singular || reason == Stop::step || reason == Stop::min_step ||
+         reason == Stop::energy;
+}
+
 std::optional<Stop> StepLoop::make_step(double bound, bool last) {
   if (const auto stop = prepare_step(bound)) return stop;
   if (system->core.rank && !method_->is_repeating()) {
@@ -248,7 +254,10 @@ std::optional<Stop> StepLoop::make_step(double bound, bool last) {
       }
     }
   }
-  return make_ordinary_step(bound, last);
+  auto stop = make_ordinary_step(bound, last);
+  if (stop && crossing_.blocking() && may_follow_from_rank_loss(stop->reason))
+    stop = Stop{Stop::rank, crossing_.blocking()->t, crossing_.blocking()->value};
+  return stop;
 }
 
 std::optional<Stop> StepLoop::make_ordinary_step(double bound, bool last) {
