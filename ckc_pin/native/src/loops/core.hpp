@@ -295,6 +295,7 @@ class Core {
   long basis_configuration_ = -1, inertia_configuration_ = -1;
   Vector bias_without_springs_, x_, y_, elastic_, residual_, z_, d_, rho_dot_q_dot_;
   Eigen::ColPivHouseholderQR<Matrix> qr_;
+  long qr_configuration_ = -1;  // `configuration_count` of qr_
   Eigen::CompleteOrthogonalDecomposition<Matrix> transposed_;
   Matrix tangent_matrix_, by_state_, force_derivative_, responses_;
   DefiniteFactor tangent_factor_;

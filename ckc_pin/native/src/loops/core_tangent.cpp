@@ -72,7 +72,10 @@ void Core::take_pivots_as_partition() {
 
 // J P = Q [R S]. The columns without a pivot are the freedoms. Lengths are in units of the mechanism's size.
 bool Core::find_basis_by_pivoting(double min_pivot) {
-  qr_.compute(constraints.J() * scales.columns.asDiagonal());
+  if (qr_configuration_ != configuration_count) {
+    qr_.compute(constraints.J() * scales.columns.asDiagonal());
+    qr_configuration_ = configuration_count;
+  }
   const auto& r = qr_.matrixQR();
   const auto& order = qr_.colsPermutation().indices();
   if (rank && !(std::abs(r(rank - 1, rank - 1)) > min_pivot * std::abs(r(0, 0)))) return false;
