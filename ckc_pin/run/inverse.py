@@ -105,7 +105,7 @@ def inverse_dynamics(
         if isinstance(what, Run):
             scene, mechanism = _scene_of(what, overrides or {}), what.mechanism
             actuation = build_scene_actuation(scene, mechanism)
-            motion, t_end = recorded_motion(what, mechanism), float(what.t[-1])
+            motion, t_end = recorded_motion(what), float(what.t[-1])
         else:
             scene = what
             mechanism, t_end = load_scene_mechanism(scene), scene.spec.t_end

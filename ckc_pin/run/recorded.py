@@ -18,7 +18,6 @@ from ckc_pin.control.forces import body_wrenches, generalized_force
 from ckc_pin.dynamics.formulations import dae_acceleration, multipliers, tangent_basis
 from ckc_pin.dynamics.terms import Terms
 from ckc_pin.errors import InputError, NumericalError
-from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.run.run import Run
 
 __all__ = ["Instant", "RecordedJoints", "compute_loop_forces", "compute_recorded_dynamics", "recorded_motion"]
@@ -29,7 +28,7 @@ HOLDING_RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Instant:
-    """One instant of a motion.
+    """State, acceleration and applied forces at one instant of a motion.
 
     Attributes
     ----------
@@ -54,14 +53,14 @@ class Instant:
     link_wrenches: Array
 
 
-def recorded_motion(run: Run, mechanism: Mechanism) -> Iterator[Instant]:
-    """Yield the motion that a run recorded."""
+def recorded_motion(run: Run) -> Iterator[Instant]:
+    """Yield the instants of a run (InputError if its loops are open)."""
     if np.any(run.w[0]):
         raise InputError(
             f"{run.scene_name}: the run starts off phi = 0, with open loops; no forces in a closed mechanism produce "
             "its motion"
         )
-    record = _Record(run, mechanism)
+    record = _Record(run)
     for k in range(len(run.t)):
         yield record.instant(k)
 
@@ -69,13 +68,13 @@ def recorded_motion(run: Run, mechanism: Mechanism) -> Iterator[Instant]:
 class _Record:
     """The instants of a run, with its accelerations by eq. 1."""
 
-    def __init__(self, run: Run, mechanism: Mechanism) -> None:
-        self.run, self.mechanism = run, mechanism
+    def __init__(self, run: Run) -> None:
+        self.run = run
         self.joints = RecordedJoints(run)
 
     def instant(self, k: int) -> Instant:
-        """Return the instant of a row (NumericalError if J has lost rank there)."""
-        run, mechanism, t = self.run, self.mechanism, float(self.run.t[k])
+        """Return the k-th output instant (NumericalError if J has lost rank there)."""
+        run, mechanism, t = self.run, self.run.mechanism, float(self.run.t[k])
         at = mechanism.kinematics(mechanism.tree.from_coordinates(run.q_tree[k]))
         terms = Terms(mechanism, at, run.v_tree[k])
         wrenches = body_wrenches(run.forces_at(k), t, terms)
@@ -170,7 +169,7 @@ def compute_recorded_dynamics(run: Run) -> tuple[Array, Array]:
     multipliers : (m, rows) array
         Both are NaN where J has lost rank.
     """
-    record = _Record(run, run.mechanism)
+    record = _Record(run)
     accelerations, forces = np.full_like(run.v_tree, np.nan), np.full_like(run.phi, np.nan)
     for k in range(len(run.t)):
         with suppress(NumericalError):

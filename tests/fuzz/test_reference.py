@@ -15,6 +15,7 @@ from scripts.experiments.fuzz.read import Model, read_model
 from scripts.experiments.fuzz.reference import ReferenceIntegrator
 from scripts.experiments.fuzz.spatial import Array, apply
 from scripts.experiments.fuzz.state import compute_energy, split_state, to_coordinates, to_state
+from tests.regression.test_reference_cases import pendulum_constant
 
 PENDULUM = {
     "mechanism.toml": 'name = "pendulum"\nurdf = "pendulum.urdf"\ngravity = [0.0, -9.81, 0.0]\n',
@@ -65,9 +66,8 @@ def test_acceleration_of_a_row_of_squares_is_the_closed_form() -> None:
         for x in (angle, 0.7)
     )
     _, alpha, _ = reference.dynamics.compute_accelerations(to_state(reference.model, q[None], v[None]), q[None])
-    k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
     rods = [reference.model.labels.index(f"theta_{k}") for k in range(N + 1)]
-    assert np.abs(alpha[0, rods, 2] + k * np.cos(angle)).max() < 1e-11
+    assert np.abs(alpha[0, rods, 2] + pendulum_constant(N) * np.cos(angle)).max() < 1e-11
 
 
 def test_andrews_mechanism_ends_at_the_published_state() -> None:

@@ -15,6 +15,7 @@ from ckc_pin.mechanism.pose import Pose
 from ckc_pin.mechanism.rank import compute_rank
 from tests.analytic.five_bar import Array
 from tests.conftest import assert_close
+from tests.regression.test_reference_cases import pendulum_constant
 
 
 def random_sparse(rows: int, columns: int, seed: int) -> Array:
@@ -113,7 +114,7 @@ def test_many_squares_move_as_one_pendulum() -> None:
     assert_close(mechanism.assembled.rho[:, 0], signs, 1e-10)
     assert mechanism.assembled.phi_z_factor.determinant() != 0.0
     start = {"initial.q": {"theta_0": 1.2}, "initial.q_dot": {"theta_0": -1.0}, "t_end": 0.3, "solver.rtol": 1e-9}
-    k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
+    k = pendulum_constant(N)
     pendulum = solve_ivp(lambda _, y: [y[1], -k * np.cos(y[0])], (0, 0.3), [1.2, -1.0], rtol=1e-11, atol=1e-12)
     for formulation in ("dae", "reduced"):
         run = simulate("n_four_bar", {"mechanism.N": N, "formulation": formulation, **start})

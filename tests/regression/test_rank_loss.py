@@ -14,7 +14,7 @@ from scipy.special import ellipkinc
 from ckc_pin import Run, simulate
 from ckc_pin.errors import NumericalError
 from tests.regression import one_freedom
-from tests.regression.test_reference_cases import first_top_pin
+from tests.regression.test_reference_cases import first_top_pin, pendulum_constant
 
 # --- flat every half turn ------------------------------------------------------------------------
 
@@ -88,8 +88,7 @@ def test_outputs_across_a_crossing_are_accurate() -> None:
 
 def first_flat(N: int) -> float:
     """Time at which the rods lie flat, s: chi = (pi/2 - theta) / 2 has the rate sqrt(1 + 4 k sin(chi)^2) / 2."""
-    k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
-    return float(2 * ellipkinc(np.pi / 4, -4 * k))
+    return float(2 * ellipkinc(np.pi / 4, -4 * pendulum_constant(N)))
 
 
 @pytest.mark.parametrize("rtol", [1e-5, 1e-8, 1e-11])

@@ -118,9 +118,14 @@ def test_stiff_flyball_governor(formulation: str) -> None:
 # --- N-four-bar ----------------------------------------------------------------------------------
 
 
+def pendulum_constant(N: int) -> float:
+    """Constant k of N squares in a row, 1/s^2. All rods keep the same angle: theta_ddot = -k cos(theta)."""
+    return 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
+
+
 def first_top_pin(N: int, t: float) -> tuple[float, float]:
-    """All rods keep the same angle: theta_ddot = -k cos(theta)."""
-    k = 9.81 * 3 * (3 * N + 1) / (2 * (4 * N + 1))
+    """Position of the first top pin at t, m."""
+    k = pendulum_constant(N)
     motion = solve_ivp(
         lambda _, y: (y[1], -k * np.cos(y[0])), (0, t), (np.pi / 2, -1.0), "DOP853", rtol=1e-13, atol=1e-14
     )
