@@ -164,7 +164,8 @@ def test_repeated_run_gives_equal_results() -> None:
     """A measured run, from a loop that has run before, gives the result of a user's run."""
     setting = Setting("reduced", "DOP853", 1e-6)
     motion = ours.compute(SHORT_WORK, setting, 60.0)
-    run = simulate(SHORT_WORK.load(formulation="reduced", solver__method="DOP853", solver__rtol=1e-6))
+    overrides = {"solver__method": "DOP853", "solver__rtol": 1e-6, "solver__terms": SHORT_WORK.terms}
+    run = simulate(SHORT_WORK.load(formulation="reduced", **overrides))
     assert np.array_equal(motion.q_tree, run.q_tree)
     assert np.array_equal(motion.v_tree, run.v_tree)
     assert (motion.steps, motion.rhs) == (run.stats["steps"], run.stats["rhs"])
