@@ -6,6 +6,7 @@ than Pinocchio itself. For a 4 x 4 matrix `numpy.linalg.solve` takes ten times a
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,6 +35,7 @@ MIN_PIVOT = 1e-12  # of the largest pivot of a Jacobian: below it the Jacobian h
 SHARED_PIVOT_RATIO = 0.1  # of the smallest pivot of the matrix whose choice of columns other matrices share
 MAX_SHARED_ENTRY = 2.0  # of a basis of a null space; with a choice of its own hardly an entry is larger than 1
 MIN_SPARSE_SIZE = 20_000  # entries of a matrix whose zeros are worth skipping
+MIN_THREADED_SIZE = 32  # rows or columns of a matrix; OpenBLAS uses threads from 48 on, measured on two cores
 SCIPY = "scipy.linalg"  # comes with a BLAS library of its own
 
 
@@ -72,7 +74,7 @@ _one_thread = _OneThread()
 
 
 @contextmanager
-def one_blas_thread(*, with_scipy: bool = False) -> Iterator[None]:
+def one_blas_thread(*, with_scipy: bool = False, size: float = math.inf) -> Iterator[None]:
     """Keep BLAS on one thread within a `with` block.
 
     The matrices of a mechanism are small, so threads cost more than they save. On a busy machine the factorization of
@@ -83,7 +85,13 @@ def one_blas_thread(*, with_scipy: bool = False) -> Iterator[None]:
     with_scipy : bool
         Import `scipy.linalg` first, for a block that calls it. SciPy has a BLAS of its own, which cannot be limited
         before it is loaded.
+    size : float
+        Rows or columns of the largest matrix. For small ones BLAS takes one thread without being told, and to find its
+        libraries takes longer than to assemble a small mechanism.
     """
+    if size < MIN_THREADED_SIZE:
+        yield
+        return
     if with_scipy:
         import_module(SCIPY)
     _one_thread.enter()

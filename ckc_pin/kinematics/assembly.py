@@ -53,7 +53,7 @@ def assemble_mechanism(
     """
     linkage = Linkage(spec, sources, overrides)
     tree = linkage.tree
-    with one_blas_thread():
+    with one_blas_thread(size=_size(linkage)):
         guess = tree.vector(spec.q_guess, tree.coordinates, "q_guess", fill=0.0)
         guess = _apply_couplings(linkage, guess)
         mechanism = _create_mechanism(linkage, _assemble(linkage, tree.from_coordinates(guess), explain))
@@ -90,7 +90,7 @@ def open_loops(spec: MechanismSpec, sources: Sources, q_tree: Mapping[str, float
     as_tree = assemble_mechanism(msgspec.structs.replace(spec, loop=[], coupling=[]), sources)
     linkage = Linkage(spec, sources, None)
     at = Kinematics(linkage.tree, linkage.closure, as_tree.partition, as_tree.q_tree)
-    with one_blas_thread():
+    with one_blas_thread(size=_size(linkage)):
         opened = _create_mechanism(linkage, _measure(linkage, at))
     return as_tree, opened
 
@@ -123,7 +123,7 @@ def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tu
     home = mechanism.tree.to_coordinates(mechanism.q_tree)
     positions = {name: float(home[mechanism.tree.index[name]]) for name in mechanism.prescribed}
     linkage = Linkage(mechanism.spec, mechanism.sources, overrides, positions)
-    with one_blas_thread():
+    with one_blas_thread(size=_size(linkage)):
         here = _close_on_branch(linkage, at, mechanism.tolerance)
         try:
             assembled = _close_on_branch(linkage, mechanism.assembled, mechanism.tolerance)
@@ -132,6 +132,11 @@ def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tu
         rebuilt = _create_mechanism(linkage, assembled, mechanism.independent)
         rebuilt.warnings += find_model_warnings(rebuilt)
     return rebuilt, rebuilt.kinematics(here.q_tree)
+
+
+def _size(linkage: Linkage) -> int:
+    """Return the size of the largest matrix of an assembly, that of eq. 1."""
+    return linkage.tree.n + linkage.closure.rows
 
 
 def _close_on_branch(linkage: Linkage, at: Kinematics, tolerance: float) -> Assembly:

@@ -66,6 +66,13 @@ def test_run_in_json_does_not_import_graphics() -> None:
     assert not modules & (VIEW | {"PIL", "tornado", "zmq", "scipy", "rich.console"})
 
 
+def test_only_large_matrices_are_kept_on_one_thread() -> None:
+    """For small ones BLAS takes one thread without being told."""
+    small, _ = _modules(f'import ckc_pin; ckc_pin.load("slider_crank"); {LIST}')
+    large, _ = _modules(f'import ckc_pin; ckc_pin.load("talos"); {LIST}')
+    assert "threadpoolctl" in large - small
+
+
 def test_command_imports_no_other_command() -> None:
     modules, _ = _modules(RUN, "run", "five_bar/swing", "--set", "t_end=0.01", "--json")
     expected = {f"ckc_pin.cli.{name}" for name in ("app", "options", "output", "runs", "signals")}
