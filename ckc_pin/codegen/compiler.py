@@ -7,7 +7,6 @@ import platform
 import signal
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -35,8 +34,7 @@ COMPILER_TIMEOUT_S = 600.0
 POLL_PERIOD_S = 0.05  # how soon the program is killed after an interrupt
 
 
-@dataclass(frozen=True)
-class Compiler:
+class Compiler(msgspec.Struct, frozen=True):
     """A C compiler with flags; `key` identifies both in names of cached files."""
 
     path: str

@@ -10,12 +10,12 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.base.atomic_files import open_atomic, temporary_folder
@@ -45,8 +45,7 @@ COMPILE_S_PER_CHARACTER = 4e-5  # s of the compiler per character of C source, m
 MAX_COORDINATES, MAX_MOVED_JOINTS = 130, 820
 
 
-@dataclass(frozen=True)
-class Library:
+class Library(Struct, frozen=True):
     """Compiled terms of one mechanism.
 
     Attributes
@@ -140,8 +139,7 @@ def compile_terms(
     return _make(_with_numbers_of_files(mechanism, subject), subject, compiler, on_written)
 
 
-@dataclass(frozen=True)
-class _Subject:
+class _Subject(Struct, frozen=True):
     """A mechanism's key in the cache, and the arguments of its code."""
 
     key: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,13 +41,7 @@ def structure_key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
         )
         if k > 0
     ]
-    groups = [
-        (
-            type(group).__name__,
-            {name: np.asarray(x).tolist() for name, x in vars(group).items() if _is_constant(group, name)},
-        )
-        for group in closure.groups
-    ]
+    groups = [(type(group).__name__, _constants(group)) for group in closure.groups]
     anchors = closure.anchors
     table = (anchors.point_joint.tolist(), anchors.direction_joint.tolist(), anchors.direction_local.tolist())
     arguments = {name: x.tolist() for name, x in which.items()}
@@ -54,10 +49,16 @@ def structure_key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
     return hash_of((_package_hash(), joints, groups, table, arguments, springs, mechanism.redundant))
 
 
-def _is_constant(group: object, name: str) -> bool:
-    """Return whether an attribute of a group of rows is written into the code as a constant."""
-    is_curve = isinstance(group, Curved) and name not in ("matrix", "offset")
-    return isinstance(group, RelativeLog) or is_curve or name in ("out", "pair", "direction", "a", "b")
+def _constants(group: Any) -> dict[str, Any]:
+    """Return the attributes of a group of rows that are written into the code as constants."""
+    is_relative, is_curve = isinstance(group, RelativeLog), isinstance(group, Curved)
+    return {
+        name: np.asarray(getattr(group, name)).tolist()
+        for name in group.__struct_fields__
+        if is_relative
+        or (is_curve and name not in ("matrix", "offset"))
+        or name in ("out", "pair", "direction", "a", "b")
+    }
 
 
 @cache

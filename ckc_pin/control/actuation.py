@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.linear_algebra import pivoted_columns
@@ -85,8 +85,7 @@ def _vector(value: Any, names: Sequence[str], what: str) -> Array:
     return vector
 
 
-@dataclass(frozen=True)
-class Effort:
+class Effort(Struct, frozen=True):
     """Forces of the actuators at one instant: tau by motor, u' on the tree, u = rho^T u'."""
 
     tau: Array

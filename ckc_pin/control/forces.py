@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
@@ -159,8 +160,7 @@ def as_vector(value: Any, what: str, expected: str) -> Array:
     return vector
 
 
-@dataclass(frozen=True)
-class BodyForce:
+class BodyForce(Struct, frozen=True):
     """A force and a moment on the body of a joint.
 
     Attributes

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, IntArray, lazy
 from ckc_pin.mechanism.batch import ManyPoses, evaluate_closure, evaluate_group

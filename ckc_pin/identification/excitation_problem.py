@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.errors import InputError
@@ -39,8 +39,7 @@ VIOLATION_PRICE = 100.0  # in the criterion, of a violation by one size
 FAILURE = 1e3  # value of a motion that cannot be followed, above the logarithm of any condition number
 
 
-@dataclass(frozen=True, eq=False)
-class Limits(Immutable):
+class Limits(Immutable, frozen=True):
     """Limits of all quantities of a motion: coordinates, rates, accelerations, shaft speeds, torques, singular values.
 
     Attributes
@@ -71,8 +70,7 @@ class Limits(Immutable):
         return np.asarray(self.violation(quantities).max(axis=(0, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Instants(Immutable):
+class Instants(Immutable, frozen=True):
     """A motion at m instants with its quantities and its weighted regressor.
 
     Attributes

@@ -7,10 +7,10 @@ smaller than half of such a unit. Every other direction is left out of the solut
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
@@ -28,8 +28,7 @@ MAX_LAG = 0.05  # of the number of instants
 NOISE_FLOOR = 1e-13  # of the largest right-hand side
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFit(Immutable):
+class LinearFit(Immutable, frozen=True):
     """Solution of columns x = right in the least-squares sense, in typical sizes.
 
     Attributes

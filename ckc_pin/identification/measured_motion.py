@@ -8,10 +8,10 @@ accelerations follow in the same sense.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
 from ckc_pin.errors import InputError
@@ -35,8 +35,7 @@ MAX_UNCERTAIN = 0.1  # share of the instants at which the sign of a moving joint
 FOLLOW_FACTOR = 8.0  # a larger distance of the manifold from the measurements, in units of noise, is another branch
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredMotion(Immutable):
+class MeasuredMotion(Immutable, frozen=True):
     """A motion of a mechanism at m instants.
 
     Attributes

@@ -7,10 +7,10 @@ to the unknowns and to the start.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns
@@ -42,8 +42,7 @@ __all__ = [
 RTOL = 1e-10  # of runs
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedMotion(Immutable):
+class RecordedMotion(Immutable, frozen=True):
     """One record with the inputs of its runs.
 
     Attributes
@@ -75,8 +74,7 @@ class RecordedMotion(Immutable):
         return replace(self, values=np.where(self.t <= part * np.nanmax(self.t), self.values, np.nan))
 
 
-@dataclass(frozen=True, eq=False)
-class MotionRun(Immutable):
+class MotionRun(Immutable, frozen=True):
     """A run: coordinates (rows, n), first rates (d,), measured quantities (m, k), and derivatives of these.
 
     The derivatives are by unknown (m, k, p) and by start (m, k, 2 d).

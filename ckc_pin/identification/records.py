@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import field
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.base.validation import suggest_name
@@ -25,8 +25,7 @@ MAX_BYTES = 2_000_000_000
 RECORDED = ("q_tree", "v_tree", "tau", "point_positions")
 
 
-@dataclass(frozen=True, eq=False)
-class Record(Immutable):
+class Record(Immutable, frozen=True):
     """Measurements of one motion.
 
     Attributes

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pinocchio as pin
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.identification.measured_motion import MeasuredMotion

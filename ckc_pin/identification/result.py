@@ -58,8 +58,7 @@ class Residual:
     autocorrelation: float
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction(Immutable):
+class Prediction(Immutable, frozen=True):
     """Measured and predicted quantities along one record.
 
     Attributes

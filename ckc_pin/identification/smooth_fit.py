@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,8 +14,7 @@ MAX_EDGE_STD = 3.0  # standard deviation of an acceleration at an end, relative 
 EDGE_GRID = 50  # instants of each third at the ends, at which it is computed
 
 
-@dataclass(frozen=True, eq=False)
-class SmoothFit(Immutable, ABC):
+class SmoothFit(Immutable, frozen=True):
     """A smooth function of time fitted to one measured quantity.
 
     Attributes
@@ -37,11 +34,10 @@ class SmoothFit(Immutable, ABC):
     interval: float
     span: Array
 
-    @abstractmethod
     def values(self, t: Array) -> Array:
         """Return value, rate and acceleration, shape (3, len(t))."""
+        raise NotImplementedError
 
-    @abstractmethod
     def errors(self, t: Array, gains: Array) -> Array:
         """Return errors of sums of gains (3, m, r) times value, rate and acceleration at times (m,).
 
@@ -50,6 +46,7 @@ class SmoothFit(Immutable, ABC):
         (r, any) array
             Factors of independent errors of variance 1.
         """
+        raise NotImplementedError
 
 
 def describe_errors(variance: Callable[[Array, int], Array], t: Array) -> tuple[Array, Array]:

@@ -9,7 +9,6 @@ large as that of noise, which no standard deviation includes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,8 +28,7 @@ MAX_SMOOTHING = 0.1  # smoothing error of accelerations, relative to its size wi
 MIN_SAMPLES_PER_KNOT = 3.0
 
 
-@dataclass(frozen=True, eq=False)
-class SplineFit(SmoothFit):
+class SplineFit(SmoothFit, frozen=True):
     """A spline fitted to one measured quantity.
 
     Attributes

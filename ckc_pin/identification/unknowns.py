@@ -7,11 +7,11 @@ depend on these alone, and torques linearly. The parameters are mass, centre of 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from msgspec import field
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.base.validation import match_names
@@ -31,8 +31,7 @@ POSITIVE = ("mass", "friction", "damping", "armature", "rotor_inertia", "stiffne
             "restitution", "torque_limit", "speed_limit")  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Unknown(Immutable):
+class Unknown(Immutable, frozen=True):
     """A number that is estimated.
 
     Attributes
@@ -54,8 +53,7 @@ class Unknown(Immutable):
     slopes: Mapping[str, Array] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class ParameterValue(Immutable):
+class ParameterValue(Immutable, frozen=True):
     """A parameter as a function of the unknowns.
 
     Attributes

@@ -9,7 +9,6 @@ leaves open, at its ends and in gaps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +27,7 @@ MIN_NOISE = 1e-5  # relative to the measurements; less is lost in the rounding e
 MIN_MEASUREMENTS_PER_NUMBER = 2.0
 
 
-@dataclass(frozen=True, eq=False)
-class WaveFit(SmoothFit):
+class WaveFit(SmoothFit, frozen=True):
     """Waves fitted to one measured quantity.
 
     Attributes

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from random import Random
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.sparse import factorize_full_row_rank
@@ -30,8 +30,7 @@ MIN_NEARBY_RATIO = 0.1  # of a configuration's distance to NEARBY_STEP, to be co
 MAX_DIRECTIONS = 20  # in which they are searched
 
 
-@dataclass(frozen=True)
-class Assembly:
+class Assembly(Struct, frozen=True):
     """Outcome of an assembly.
 
     Attributes

@@ -8,11 +8,11 @@ whose values are prescribed: S q' = q, or p(q') = x.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import pinocchio as pin
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
@@ -30,8 +30,7 @@ __all__ = ["ExtendedClosure", "Task", "extend_closure", "find_point"]
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-@dataclass(frozen=True)
-class ExtendedClosure:
+class ExtendedClosure(Struct, frozen=True):
     """The rows [phi; S q'; p; log R] of a mechanism and one of its points.
 
     Attributes
@@ -68,8 +67,7 @@ class ExtendedClosure:
         return AXES[row - int(self.place[0])]
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(Struct, frozen=True):
     """d rows with prescribed values, which together with phi = 0 determine the configuration: Psi of eq. 3.
 
     Attributes

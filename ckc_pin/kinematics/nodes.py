@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.kinematics.continuation import MAX_SEARCH_STEP, follow_many, is_local
@@ -35,8 +35,7 @@ SAME_SHAPE_TOLERANCE = 1e-6  # mechanism sizes: distance of all points below whi
 Accept = Callable[["Nodes", "Nodes"], BoolArray]
 
 
-@dataclass
-class Nodes:
+class Nodes(Struct):
     """Solutions of a task, with the Jacobians that continuation needs.
 
     Attributes

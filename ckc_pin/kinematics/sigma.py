@@ -8,10 +8,10 @@ same for a step of q.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, IntArray
 from ckc_pin.errors import InputError
@@ -52,8 +52,7 @@ MAX_BRANCH_COORDINATES = 12  # dependent coordinates; with more, random starts w
 BRANCH_DISTANCE = 1e-6  # rad or m: configurations closer than this are the same branch
 
 
-@dataclass(frozen=True)
-class Newton:
+class Newton(Struct, frozen=True):
     """Outcome of Newton's method on z.
 
     Attributes
@@ -69,8 +68,7 @@ class Newton:
     converged: bool
 
 
-@dataclass(frozen=True)
-class Sigma:
+class Sigma(Struct, frozen=True):
     """Outcome of the search for q' = sigma(q).
 
     Attributes

@@ -7,10 +7,10 @@ loops. Only Pinocchio is called for each configuration, which takes two microsec
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, IntArray, lazy
 from ckc_pin.mechanism.closure import Closure

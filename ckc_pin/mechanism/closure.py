@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,8 +41,7 @@ LOOP_ROWS: dict[LoopType, tuple[str, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Closure(Immutable):
+class Closure(Immutable, frozen=True):
     """The constraint rows of all loops and couplings of a mechanism.
 
     Attributes
@@ -124,8 +122,7 @@ class Closure(Immutable):
         return [loop for loop, a, b in self.aligned if pose.e[a] @ pose.e[b] <= 0]
 
 
-@dataclass(frozen=True)
-class Selected(Immutable):
+class Selected(Immutable, frozen=True):
     """A selection of the rows of other groups, as one group."""
 
     groups: tuple[Rows, ...]

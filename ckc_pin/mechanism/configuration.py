@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
@@ -17,8 +15,7 @@ from ckc_pin.mechanism.tree import Tree
 __all__ = ["Kinematics", "Partition", "Psi"]
 
 
-@dataclass(frozen=True)
-class Partition(Immutable):
+class Partition(Immutable, frozen=True):
     """The partition q' = [q; z] of eq. 2: places of the independent and of the dependent coordinates in q'."""
 
     q: IntArray

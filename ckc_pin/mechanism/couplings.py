@@ -7,9 +7,9 @@ and a table are the same kind of curve, a piecewise polynomial.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.errors import MechanismError
@@ -22,8 +22,7 @@ MIN_TABLE_POINTS, MAX_TABLE_POINTS = 3, 500
 DEGREE = 5  # of the spline of a table
 
 
-@dataclass(frozen=True)
-class PiecewiseCurve:
+class PiecewiseCurve(Struct, frozen=True):
     """A piecewise polynomial p(x) with at least two continuous derivatives.
 
     Attributes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,7 @@ from ckc_pin.mechanism.spec import FrameSpec
 __all__ = ["Frame", "Frames"]
 
 
-@dataclass(frozen=True)
-class Frame(Immutable):
+class Frame(Immutable, frozen=True):
     """A frame fixed to a joint of the tree (joint 0 is the world): rotation (3, 3), translation (3,)."""
 
     joint: int

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray, lazy
@@ -36,8 +34,7 @@ def cross(a: Array, b: Array) -> Array:
     return c
 
 
-@dataclass(frozen=True)
-class Anchors(Immutable):
+class Anchors(Immutable, frozen=True):
     """Pairs of points and directions that constraint rows refer to, each fixed to a joint (0 is the world).
 
     Attributes

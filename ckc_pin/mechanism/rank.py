@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
 from ckc_pin.base.linear_algebra import pivoted_columns, remove_direction
@@ -35,8 +35,7 @@ GOOD_PIVOT, MIN_PIVOT = 0.2, 0.03
 ROUNDING_LEVEL = 1e-9  # singular values between this and RANK_TOLERANCE make the rank uncertain
 
 
-@dataclass(frozen=True)
-class RankReport:
+class RankReport(Struct, frozen=True):
     """The rank of J and how certain it is.
 
     Attributes
@@ -184,8 +183,7 @@ IDLE_TOLERANCE = 1e-6  # of the largest motion; a centre of mass rounded to six 
 IMMOBILE_TOLERANCE = 1e-9  # largest part of a coordinate that cannot move in motions of size one
 
 
-@dataclass(frozen=True)
-class Freedoms(Immutable):
+class Freedoms(Immutable, frozen=True):
     """Degrees of freedom of a mechanism, from the rank of J.
 
     Attributes

@@ -26,7 +26,6 @@ once; in C++ (`native/src`, rows.cpp) for runs; and as CasADi expressions (`code
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -70,8 +69,7 @@ class Rows(Protocol):
         """Time derivative of the constraint Jacobian at the velocity of `rate`, shape (rows, n)."""
 
 
-@dataclass(frozen=True)
-class Component(Immutable):
+class Component(Immutable, frozen=True):
     """e . r, the component of the difference of two points along a direction.
 
     `turning` is False if all directions are fixed in the world.
@@ -106,8 +104,7 @@ class Component(Immutable):
         return jacobian_dot
 
 
-@dataclass(frozen=True)
-class Dot(Immutable):
+class Dot(Immutable, frozen=True):
     """a . b of two directions, which is zero if they are perpendicular."""
 
     out: IntArray
@@ -133,8 +130,7 @@ class Dot(Immutable):
         )
 
 
-@dataclass(frozen=True)
-class Distance(Immutable):
+class Distance(Immutable, frozen=True):
     """(r . r - L^2) / (2 L), to first order the error of the distance |r| from L, in metres."""
 
     out: IntArray
@@ -158,8 +154,7 @@ class Distance(Immutable):
         )
 
 
-@dataclass(frozen=True)
-class Affine(Immutable):
+class Affine(Immutable, frozen=True):
     """A q' - c, linear in the coordinates of one-freedom joints."""
 
     out: IntArray
@@ -179,8 +174,7 @@ class Affine(Immutable):
         return np.zeros_like(self.matrix)
 
 
-@dataclass(frozen=True)
-class Curved(Affine):
+class Curved(Affine, frozen=True):
     """A q' - c - p(q'_k), where p is a piecewise polynomial of one coordinate, which A does not involve."""
 
     coordinate: IntArray  # (rows,)
@@ -214,8 +208,7 @@ class Curved(Affine):
         return self._scatter(-self.curve(self._x(pose), 2) * rate.v[self.coordinate])
 
 
-@dataclass(frozen=True)
-class RelativeLog(Immutable):
+class RelativeLog(Immutable, frozen=True):
     """log(R_A^T R_B), the rotation vector from frame A to frame B: three rows for each pair of frames."""
 
     out: IntArray  # (3 pairs,)

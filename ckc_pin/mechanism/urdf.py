@@ -17,11 +17,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import lru_cache
 from xml.etree import ElementTree
 
 import numpy as np
+from msgspec import Struct, field
 
 from ckc_pin.base.sources import parse_xml
 from ckc_pin.errors import InputError, MechanismError
@@ -48,8 +48,7 @@ WORLD = "ckc_pin_world"  # common root link of several trees
 DYNAMIC = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "dynamics")}
 
 
-@dataclass(frozen=True)
-class TreeText:
+class TreeText(Struct, frozen=True):
     """Text of a URDF, and the pose and parent of its tree."""
 
     text: str
@@ -61,8 +60,7 @@ class TreeText:
     rpy: Sequence[float] = (0.0, 0.0, 0.0)
 
 
-@dataclass
-class UrdfTree:
+class UrdfTree(Struct):
     """A checked URDF.
 
     Attributes

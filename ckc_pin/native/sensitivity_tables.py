@@ -8,11 +8,11 @@ With compiled terms, a parameter is a direction in the space of the arguments of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
+from msgspec import Struct, field
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.arguments import present, values
@@ -49,8 +49,7 @@ NOT_TERMS = (  # kinds of friction, stops, controllers and motors, on which the 
 )
 
 
-@dataclass(frozen=True)
-class PlacementJoint:
+class PlacementJoint(Struct, frozen=True):
     """A massless, locked joint whose coordinate is a placement parameter.
 
     Attributes
@@ -72,8 +71,7 @@ class PlacementJoint:
     revolute: bool = False
 
 
-@dataclass(frozen=True)
-class ParameterDerivative:
+class ParameterDerivative(Struct, frozen=True):
     """One term of the derivative of the equations of motion with respect to a parameter; the terms add up.
 
     Attributes
@@ -106,8 +104,7 @@ class ParameterDerivative:
         return self.kind in ("length", "offset", "coefficient")
 
 
-@dataclass(frozen=True)
-class SensitivityParameter:
+class SensitivityParameter(Struct, frozen=True):
     """A parameter whose sensitivities are integrated along a run.
 
     Attributes

@@ -7,7 +7,6 @@ They are exact for redundant motors too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -38,8 +37,7 @@ SMALL_WEIGHT = 1e-7
 FACET_CHUNK = 50_000  # systems of equations that are solved together
 
 
-@dataclass(frozen=True, eq=False)
-class PathDynamics(Immutable):
+class PathDynamics(Immutable, frozen=True):
     """The reduced equations of motion along a path, at m places.
 
     Attributes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,8 +31,7 @@ __all__ = [
 MAX_UNWOUND_RESIDUAL = 1e-9  # m, rad: change of phi by whole turns of dependent joints
 
 
-@dataclass(frozen=True, eq=False)
-class EndState(Immutable):
+class EndState(Immutable, frozen=True):
     """A configuration with rates of the independent coordinates."""
 
     at: Kinematics

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise, product, zip_longest
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.control.piecewise import PiecewisePolynomial
@@ -45,8 +45,7 @@ SIDE = 1e-9  # of the duration, from the end of a phase to where its torque is t
 Torques = Callable[[Array], Array]  # motor torques (m, motors) at times (m,)
 
 
-@dataclass(frozen=True, eq=False)
-class Way(Immutable):
+class Way(Immutable, frozen=True):
     """Places of a motion in the coordinates that it is planned in."""
 
     dynamics: ReducedDynamics
@@ -63,8 +62,7 @@ class Way(Immutable):
         return Way(dynamics, states, replace(self.route, places=places, members=(dynamics,)))
 
 
-@dataclass(frozen=True, eq=False)
-class FirstGuess(Immutable):
+class FirstGuess(Immutable, frozen=True):
     """An initial guess of the optimizer: a motion, the times of its places, s, and its torques if there are any."""
 
     way: Way

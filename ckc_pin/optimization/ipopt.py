@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,8 +37,7 @@ class NonlinearProgram(Protocol):
         """Return the nonzeros of the Lagrangian's Hessian, upper triangle."""
 
 
-@dataclass(frozen=True, eq=False)
-class Optimum(Immutable):
+class Optimum(Immutable, frozen=True):
     """Variables, multipliers of their bounds and of the constraints, IPOPT's status, and iterations."""
 
     w: Array

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable
 from ckc_pin.base.validation import suggest_name
@@ -17,8 +17,7 @@ from ckc_pin.optimization.spec import LimitsSpec
 __all__ = ["MotionLimits", "make_limits"]
 
 
-@dataclass(frozen=True, eq=False)
-class MotionLimits(Immutable):
+class MotionLimits(Immutable, frozen=True):
     """Limits of a motion; infinite where there is none.
 
     Attributes

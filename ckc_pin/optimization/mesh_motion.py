@@ -5,8 +5,6 @@ A motion consists of phases, from one place to the next. Each has a duration of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable, IntArray
@@ -17,8 +15,7 @@ __all__ = ["DEGREE", "Guess", "Mesh", "Places", "Solution", "gauss_points", "tim
 DEGREE = 3  # Gauss points of an interval
 
 
-@dataclass(frozen=True, eq=False)
-class Places(Immutable):
+class Places(Immutable, frozen=True):
     """Places that a motion passes, from its start to its end; its phases are between them.
 
     Attributes
@@ -41,8 +38,7 @@ class Places(Immutable):
     jumps_at_start: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh(Immutable):
+class Mesh(Immutable, frozen=True):
     """Knots of phases.
 
     Attributes
@@ -113,8 +109,7 @@ class Mesh(Immutable):
         return Mesh(np.sort(np.concatenate([self.knots, middles[halved]])))
 
 
-@dataclass(frozen=True, eq=False)
-class Guess(Immutable):
+class Guess(Immutable, frozen=True):
     """An initial guess.
 
     Attributes
@@ -155,8 +150,7 @@ class Guess(Immutable):
         return self.t[self.mesh.knot]
 
 
-@dataclass(frozen=True, eq=False)
-class Solution(Immutable):
+class Solution(Immutable, frozen=True):
     """What the optimizer returns: a `Guess`, its status, cost, parts of the cost, iterations, and largest violation."""
 
     values: Guess

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ckc_pin.base.linear_algebra import one_blas_thread
@@ -178,7 +179,7 @@ def _between_places(
     if period is not None:
         if period > limits.time:
             raise InputError(f"optimize: periodic.time: {period:g} s is above limits.time = {limits.time:g} s")
-        limits = replace(limits, time=period)
+        limits = msgspec.structs.replace(limits, time=period)
         if spec.minimize.time:
             raise InputError("optimize: periodic.time: the period is given, which minimize.time does not change; give "
                              "another weight, as effort = 1.0")  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,8 +22,7 @@ DEFAULT_ROUNDING = 0.1  # of the shorter line at a corner
 STRAIGHT_TOLERANCE = 1e-9  # of the unit directions of two lines without a corner between them
 
 
-@dataclass(frozen=True, eq=False)
-class CoordinatePath(Immutable):
+class CoordinatePath(Immutable, frozen=True):
     """A path of the independent coordinates.
 
     Attributes
@@ -36,7 +35,7 @@ class CoordinatePath(Immutable):
     """
 
     q: PiecewisePolynomial
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
     start: Array | None = None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -71,12 +70,10 @@ def _joined(parts: list[T]) -> T:
 
 
 def _by_field(values: T, combine: Callable[[list[Array]], Array], parts: Sequence[T]) -> dict[str, Any]:
-    """Return the attributes of data classes combined, also those that are tuples of arrays."""
+    """Return the attributes of structures combined, also those that are tuples of arrays."""
     result: dict[str, Any] = {}
-    for field in fields(values):
-        of_parts = [getattr(part, field.name) for part in parts]
+    for name in values.__struct_fields__:
+        of_parts = [getattr(part, name) for part in parts]
         is_tuple = isinstance(of_parts[0], tuple)
-        result[field.name] = (
-            tuple(combine(list(x)) for x in zip(*of_parts, strict=True)) if is_tuple else combine(of_parts)
-        )
+        result[name] = tuple(combine(list(x)) for x in zip(*of_parts, strict=True)) if is_tuple else combine(of_parts)
     return result

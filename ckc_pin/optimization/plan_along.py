@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, BoolArray, IntArray
 from ckc_pin.dynamics.inverse import friction_force

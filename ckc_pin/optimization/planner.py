@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -38,8 +37,7 @@ MIN_PART = 0.05  # of the last duration: a free duration is guessed to be at lea
 TOLERANCE = 1e-6  # of IPOPT, relative to the scaled problem
 
 
-@dataclass(frozen=True, eq=False)
-class HorizonPlan(Immutable):
+class HorizonPlan(Immutable, frozen=True):
     """A motion from a state on, with its motor torques.
 
     Attributes

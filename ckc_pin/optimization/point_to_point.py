@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, BoolArray, Immutable
 from ckc_pin.base.sources import Sources
@@ -173,8 +173,7 @@ def _require_durations(solution: Solution, guess: Guess, names: Sequence[str]) -
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Exceeded(Immutable):
+class Exceeded(Immutable, frozen=True):
     """Intervals in which limits are exceeded by more than `EXCESS`, and the worst quantity with its relative excess.
 
     `samples` (m,) are places in units of the mesh, with v' `rates` (m, n).

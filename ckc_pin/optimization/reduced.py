@@ -8,11 +8,11 @@ follow from the implicit function theorem.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.errors import InputError
@@ -30,8 +30,7 @@ MAX_NEWTON_STEP = 1.0  # rad, or sizes of the mechanism
 MAX_PIECES = 64  # of a step of q
 
 
-@dataclass(frozen=True, eq=False)
-class MotionInstants(Immutable):
+class MotionInstants(Immutable, frozen=True):
     """A motion at m instants.
 
     Attributes
@@ -54,8 +53,7 @@ class MotionInstants(Immutable):
     force: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives(Immutable):
+class Derivatives(Immutable, frozen=True):
     """Derivatives of `MotionInstants` by x = (q, q_dot, q_ddot, tau), each of shape (m, ..., 3 d + motors)."""
 
     q_tree: Array

@@ -60,8 +60,7 @@ class Section:
     end: float
 
 
-@dataclass(frozen=True, eq=False)
-class Cycle(Immutable):
+class Cycle(Immutable, frozen=True):
     """A motion that repeats. Its scenes have several periods.
 
     Attributes

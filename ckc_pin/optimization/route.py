@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array, Immutable, IntArray
 from ckc_pin.control.piecewise import PiecewisePolynomial
@@ -29,8 +30,7 @@ class Stay:
     duration: float
 
 
-@dataclass(frozen=True, eq=False)
-class Route(Immutable):
+class Route(Immutable, frozen=True):
     """Places that a motion passes, and how long it rests there.
 
     Attributes

@@ -7,7 +7,6 @@ al. 2009); limits of jerk, power and rates of torques do not, so that the result
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,8 +28,7 @@ SLOWER = 1.3  # duration of the initial guess, relative to the fastest motion
 MIN_B = 1e-8  # of the largest b: lower bound of b inside
 
 
-@dataclass(frozen=True, eq=False)
-class PathOptimum(Immutable):
+class PathOptimum(Immutable, frozen=True):
     """A motion along a path: its profile, the parts of its cost, and iterations of the optimizer."""
 
     profile: SpeedProfile

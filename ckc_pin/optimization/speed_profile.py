@@ -22,8 +22,7 @@ __all__ = ["Blocked", "SpeedProfile", "SpeedRows", "estimate_slopes", "fastest_p
 MAX_TIME_STEPS = 20  # of Newton's method for the duration of an interval
 
 
-@dataclass(frozen=True, eq=False)
-class SpeedRows(Immutable):
+class SpeedRows(Immutable, frozen=True):
     """Limits alpha u + beta b <= gamma and b <= largest at the points of a grid.
 
     Attributes

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.base.sources import Sources
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["DesiredPath", "compute_desired_path", "find_target", "sample_target"]
 
 
-@dataclass(frozen=True)
-class DesiredPath:
+class DesiredPath(Struct, frozen=True):
     """Desired independent coordinates q_d along a run.
 
     Attributes

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.validation import require_controller_signature, require_type
 from ckc_pin.dynamics.terms import Terms
@@ -71,8 +72,7 @@ class Event:
             raise InputError(f"Event: name = {self.name!r:.80}: expected a string")
 
 
-@dataclass(frozen=True)
-class EventFunction:
+class EventFunction(Struct, frozen=True):
     """An event function of the native loop.
 
     Attributes

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array, BoolArray
 from ckc_pin.codegen.library import Library
@@ -31,7 +31,6 @@ from ckc_pin.errors import InputError
 from ckc_pin.mechanism.mechanism import Mechanism
 from ckc_pin.native import _core
 from ckc_pin.native.control import breakpoints_table, control_table, force_tables, prescribed_tables
-from ckc_pin.native.sensitivity_tables import SensitivityParameter
 from ckc_pin.native.tables import core_table
 from ckc_pin.run.checks import require_runnable, start_warnings
 from ckc_pin.run.compiled_terms import NEVER, select_library
@@ -49,6 +48,9 @@ from ckc_pin.scene.parts import (
 from ckc_pin.scene.scene import Scene
 from ckc_pin.scene.spec import SceneSpec
 
+if TYPE_CHECKING:
+    from ckc_pin.native.sensitivity_tables import SensitivityParameter
+
 __all__ = ["Prepared", "SensitivitySetup", "SetUpSensitivities", "prepare"]
 
 # A right-hand side is evaluated this close to the constraint manifold, relative to rtol and the mechanism's size.
@@ -65,8 +67,7 @@ MEMORY_CHECK_STEP = 1e-3  # of each independent coordinate: rad, or relative to 
 NATIVE_CONTROLLERS = (SetPoint, Tracking, RecordedTorques, JointServo, Sampled)
 
 
-@dataclass(frozen=True)
-class SensitivitySetup:
+class SensitivitySetup(Struct, frozen=True):
     """Tables with which the native loop integrates sensitivities of a motion.
 
     Attributes
@@ -101,8 +102,7 @@ class SetUpSensitivities(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class Prepared:
+class Prepared(Struct, frozen=True, kw_only=True, dict=True):
     """A scene that is ready to run. It can be run several times.
 
     Attributes

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import Struct
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.spec import FeedbackSpec
@@ -27,8 +27,7 @@ __all__ = ["Start", "find_branch", "find_start", "is_chart", "prescribed_velocit
 MAX_ROUNDING = 1e-4
 
 
-@dataclass(frozen=True)
-class Start:
+class Start(Struct, frozen=True):
     """An initial state.
 
     Attributes

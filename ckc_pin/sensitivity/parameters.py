@@ -7,11 +7,11 @@ act. The gains of the controller and the start are parameters of the scene.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pinocchio as pin
+from msgspec.structs import replace
 
 from ckc_pin.base.arrays import Array
 from ckc_pin.control.actuation import Actuation

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -393,7 +394,7 @@ def test_report_escapes_names():
 
     result = identify("five_bar", record("five_bar", 1e-4, 0.01), PARAMETERS)
     name = "<script>alert(1)</script>"
-    motions = tuple(replace(x, source=name) for x in result.motions)
+    motions = tuple(msgspec.structs.replace(x, source=name) for x in result.motions)
     warned = replace(
         result, motions=motions, warnings=(name,), parameters={name: result.parameters["link.link_1.mass"]}
     )
