@@ -14,7 +14,6 @@ constexpr double min_pivot_ratio = 1e-6;
 
 namespace {
 
-
 using Spatial = ArticulatedBodies::Spatial;
 using SpatialInertia = ArticulatedBodies::SpatialInertia;
 using Coordinate = ArticulatedBodies::Coordinate;
@@ -65,29 +64,30 @@ ALWAYS_INLINE void add(const RigidBody& body, SpatialInertia& sum) {
 }
 
 WITH_WIDEST_REGISTERS bool factorize_bodies(std::vector<Coordinate>& coordinates, const std::vector<RigidBody>& bodies,
-                                            std::vector<RigidBody>& composites, const Indices& place,
-                                            const std::vector<char>& is_leaf, std::vector<SpatialInertia>& articulated) {
+                                            std::vector<RigidBody>& composites, const std::vector<char>& is_leaf,
+                                            std::vector<SpatialInertia>& articulated) {
   for (auto at = coordinates.rbegin(); at != coordinates.rend(); ++at) {
-    SpatialInertia& inertia = articulated[place[at->joint]];
+    SpatialInertia& inertia = articulated[at->place];
     if (at->is_last) {
       if (is_leaf[at->joint]) inertia = {};
       add(bodies[at->joint], inertia);
     }
     Vector8 product[6];
     for (int c = 0; c < 6; ++c) product[c] = vector_of(inertia.column[c].x) * at->axis.x[entry[c]];
-    const Vector8 force = ((product[0] + product[1]) + (product[2] + product[3])) + (product[4] + product[5]);
-    vector_of(at->force.x) = force;
-    const double pivot = dot(at->axis, at->force) + at->armature;
+    Spatial force;
+    vector_of(force.x) = ((product[0] + product[1]) + (product[2] + product[3])) + (product[4] + product[5]);
+    const double pivot = dot(at->axis, force) + at->armature;
     const RigidBody& composite = composites[at->joint];
     at->inertia = inertia_along(composite, at->axis) + at->armature;
     if (!(pivot > min_pivot_ratio * at->inertia)) return false;
     at->inverse = 1.0 / pivot;
+    vector_of(at->response.x) = vector_of(force.x) * at->inverse;
     if (at->is_first && !at->parent) continue;
-    for (int c = 0; c < 6; ++c) vector_of(inertia.column[c].x) -= force * (at->force.x[entry[c]] * at->inverse);
+    for (int c = 0; c < 6; ++c) vector_of(inertia.column[c].x) -= vector_of(force.x) * at->response.x[entry[c]];
     if (!at->is_first) continue;
     add(composite, composites[at->parent]);
-    SpatialInertia& above = articulated[place[at->parent]];
-    if (&above == &inertia) continue;
+    if (at->parent_place == at->place) continue;
+    SpatialInertia& above = articulated[at->parent_place];
     for (int c = 0; c < 6; ++c) vector_of(above.column[c].x) += vector_of(inertia.column[c].x);
   }
   return true;
@@ -108,32 +108,33 @@ ALWAYS_INLINE void add_rows(const Spatial& vector, const T& factor, T* rows) {
 template <class T>
 ALWAYS_INLINE void sweep_to_roots(const std::vector<Coordinate>& coordinates, const Indices& chosen, T* carried, double* x) {
   for (int k : chosen)
-    for (int c = 0; c < 6; ++c) carried[6 * coordinates[k].joint + c] = T{};
+    for (int c = 0; coordinates[k].is_first && c < 6; ++c) carried[6 * coordinates[k].place + c] = T{};
   for (auto i = static_cast<int>(chosen.size()) - 1; i >= 0; --i) {
     const Coordinate& at = coordinates[chosen[i]];
-    T* const force = carried + 6 * at.joint;
+    T* const force = carried + 6 * at.place;
     T load, value;
     multiply_rows(at.axis, force, load), read(x, i, value);
     load = value - load, write(load, i, x);
     if (at.is_first && !at.parent) continue;
-    load *= at.inverse;
-    add_rows(at.force, load, force);
-    if (!at.is_first) continue;
-    T* const sum = carried + 6 * at.parent;
+    add_rows(at.response, load, force);
+    if (!at.is_first || at.parent_place == at.place) continue;
+    T* const sum = carried + 6 * at.parent_place;
     for (int c = 0; c < 6; ++c) sum[c] += force[c];
   }
 }
 
 template <class T>
 ALWAYS_INLINE void sweep_to_leaves(const std::vector<Coordinate>& coordinates, T* carried, const double* x, double* a) {
-  for (int c = 0; c < 6; ++c) carried[c] = T{};  // the world's motion
   for (size_t k = 0; k < coordinates.size(); ++k) {
     const Coordinate& at = coordinates[k];
-    T* const motion = carried + 6 * at.joint;
-    for (int c = 0; at.is_first && c < 6; ++c) motion[c] = carried[6 * at.parent + c];
+    T* const motion = carried + 6 * at.place;
+    if (at.is_first && !at.parent)
+      for (int c = 0; c < 6; ++c) motion[c] = T{};
+    else if (at.is_first && at.parent_place != at.place)
+      for (int c = 0; c < 6; ++c) motion[c] = carried[6 * at.parent_place + c];
     T load, value;
-    multiply_rows(at.force, motion, load), read(x, k, value);
-    const T acceleration = (value - load) * at.inverse;
+    multiply_rows(at.response, motion, load), read(x, k, value);
+    const T acceleration = value * at.inverse - load;
     write(acceleration, k, a);
     add_rows(at.axis, acceleration, motion);
   }
@@ -154,9 +155,9 @@ WITH_WIDEST_REGISTERS void accelerate_block(const std::vector<Coordinate>& coord
 }  // namespace
 
 ArticulatedBodies::ArticulatedBodies(const Tree& tree)
-    : coordinates_(tree.n), bodies_(tree.joints), composites_(tree.joints), motions_(tree.joints), place_(tree.joints, -1),
+    : coordinates_(tree.n), bodies_(tree.joints), composites_(tree.joints), motions_(tree.joints),
       is_leaf_(tree.joints, 1), all_(tree.n), gravity_(Vector3::Zero()), reference_(Vector3::Zero()),
-      carried_(static_cast<size_t>(6) * tree.joints), bias_(Vector::Zero(tree.n)) {
+      bias_(Vector::Zero(tree.n)) {
   std::iota(all_.begin(), all_.end(), 0);
   for (int k = 0; k < tree.n; ++k) {
     Coordinate& at = coordinates_[k];
@@ -164,14 +165,16 @@ ArticulatedBodies::ArticulatedBodies(const Tree& tree)
     at.is_first = !k || tree.joint_of[k - 1] != at.joint;
     at.is_last = k + 1 == tree.n || tree.joint_of[k + 1] != at.joint;
   }
+  Indices place(tree.joints, -1);
   int places = 0;
   for (int joint = tree.joints - 1; joint > 0; --joint) {
-    if (place_[joint] < 0) place_[joint] = places++;
+    if (place[joint] < 0) place[joint] = places++;
     const int above = tree.parent[joint];
-    if (place_[above] < 0) place_[above] = place_[joint];
+    if (place[above] < 0) place[above] = place[joint];
     is_leaf_[above] = 0;
   }
-  articulated_.resize(places);
+  for (Coordinate& at : coordinates_) at.place = place[at.joint], at.parent_place = place[at.parent];
+  articulated_.resize(places), carried_.resize(static_cast<size_t>(6) * places);
 }
 
 // The reference point is on the mechanism: far from it, sums of moments lose digits.
@@ -231,7 +234,7 @@ Vector6 ArticulatedBodies::at_origin(const Spatial& motion) const {
 
 bool ArticulatedBodies::factorize() {
   composites_ = bodies_;
-  return factorize_bodies(coordinates_, bodies_, composites_, place_, is_leaf_, articulated_);
+  return factorize_bodies(coordinates_, bodies_, composites_, is_leaf_, articulated_);
 }
 
 template <int size>

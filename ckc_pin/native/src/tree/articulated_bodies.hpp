@@ -27,10 +27,11 @@ class ArticulatedBodies {
   };
   struct Coordinate {
     int joint, parent;         // the parent of the joint
+    int place, parent_place;   // of these in articulated_ and carried_
     bool is_first, is_last;    // of its joint
     double armature, inertia;  // of all that the coordinate moves: D'(k, k)
     double inverse;            // of the pivot
-    Spatial axis, force;       // force: articulated inertia times axis
+    Spatial axis, response;    // response: articulated inertia times axis, divided by the pivot
   };
   struct Motion {
     Spatial velocity, acceleration, force;  // force: that this acceleration takes
@@ -62,14 +63,12 @@ class ArticulatedBodies {
   std::vector<Coordinate> coordinates_;
   std::vector<RigidBody> bodies_, composites_;  // by joint; composites: with all bodies behind the joint, as one
   std::vector<Motion> motions_;                 // by joint, of `compute_bias`
-  // Inertias of the bodies behind a joint, of which all joints have been eliminated. A joint and the last one behind it
-  // share theirs, so that a chain has a single one.
-  std::vector<SpatialInertia> articulated_;
-  Indices place_;              // by joint: in articulated_
+  // By place. A joint and the last one behind it share a place, so that a chain has a single one.
+  std::vector<SpatialInertia> articulated_;  // of the bodies behind a joint, of which all joints have been eliminated
+  std::vector<Spatial> carried_;             // six rows of forces on these bodies, or of motions
   std::vector<char> is_leaf_;  // by joint
   Indices all_;
   Vector3 gravity_, reference_;
-  std::vector<Spatial> carried_;  // by joint: six rows of forces or motions
   Vector bias_;
 };
 
