@@ -1,6 +1,8 @@
 #include "loops/articulated_elimination.hpp"
 
 #include <algorithm>
+#include <cmath>
+#include <limits>
 #include <map>
 #include <set>
 
@@ -11,6 +13,8 @@ namespace ckc {
 
 constexpr int block_size = ArticulatedBodies::block_size;
 using Places = std::vector<std::pair<int, int>>;
+// Of a row, relative to the sum of the magnitudes of its terms: two roundings of each.
+constexpr double max_residual = 2 * std::numeric_limits<double>::epsilon();
 
 static const Vector8& row_of(const double* block, int place) {
   return *reinterpret_cast<const Vector8*>(block + static_cast<ptrdiff_t>(place) * block_size);
@@ -130,13 +134,14 @@ void ArticulatedElimination::add_row_forces(const Block<size>& rates, Block<size
 template <int size>
 void ArticulatedElimination::Workspace<size>::resize(Eigen::Index n, Eigen::Index rows) {
   for (Block<size>* vectors : {&x, &a, &correction}) vectors->setZero(n, size);
-  for (Block<size>* vectors : {&residual, &rates}) vectors->setZero(rows, size);
+  for (Block<size>* vectors : {&residual, &rates, &magnitudes}) vectors->setZero(rows, size);
 }
 
-// Solve for the forces x, with J a = -residual, and refine once: J D'^-1 J^T has the square of J's condition number.
+// Solve for the forces x, with J a = -residual. J D'^-1 J^T has the square of J's condition number, therefore the solution
+// is refined once, unless J a differs from -residual by no more than its own rounding.
 template <int size>
 void ArticulatedElimination::solve_block(Workspace<size>& of) {
-  auto& [x, a, correction, residual, rates] = of;
+  auto& [x, a, correction, residual, rates, magnitudes] = of;
   bodies.eliminate(bodies.all(), x);
   rates = -residual;
   for (const Group& group : groups_)
@@ -150,10 +155,16 @@ void ArticulatedElimination::solve_block(Workspace<size>& of) {
     }
   add_row_forces(rates, x);
   bodies.accelerate(x, a);
-  rates = -residual;
+  rates = -residual, magnitudes = residual.cwiseAbs();
   for (const Group& group : groups_)
-    for (const Group::Entry& entry : group.entries)
-      rates.row(group.rows[static_cast<size_t>(entry.place % block_size)]) -= entry.value * a.row(entry.column);
+    for (const Group::Entry& entry : group.entries) {
+      const int row = group.rows[static_cast<size_t>(entry.place % block_size)];
+      for (int l = 0; l < size; ++l) {
+        const double term = entry.value * a(entry.column, l);
+        rates(row, l) -= term, magnitudes(row, l) += std::abs(term);
+      }
+    }
+  if ((rates.array().abs() <= max_residual * magnitudes.array()).all()) return;
   x.setZero();
   add_row_forces(rates, x);
   bodies.accelerate(x, correction);

@@ -52,7 +52,8 @@ class ArticulatedElimination {
   template <int size>
   struct Workspace {
     Block<size> x, a, correction;  // x: forces, then sums of L^-1 times forces; (n)
-    Block<size> residual, rates;   // (kept rows)
+    // (kept rows); magnitudes: sums of the absolute values of all terms of J a + residual
+    Block<size> residual, rates, magnitudes;
     void resize(Eigen::Index n, Eigen::Index rows);
   };
   template <int size>
