@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABCMeta, abstractmethod
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 
 from ckc_pin.base.arrays import Array, Immutable
@@ -14,7 +16,11 @@ MAX_EDGE_STD = 3.0  # standard deviation of an acceleration at an end, relative 
 EDGE_GRID = 50  # instants of each third at the ends, at which it is computed
 
 
-class SmoothFit(Immutable, frozen=True):
+class _AbstractStruct(msgspec.StructMeta, ABCMeta):
+    """Metaclass of structures with abstract methods."""
+
+
+class SmoothFit(Immutable, frozen=True, metaclass=_AbstractStruct):
     """A smooth function of time fitted to one measured quantity.
 
     Attributes
@@ -34,10 +40,11 @@ class SmoothFit(Immutable, frozen=True):
     interval: float
     span: Array
 
+    @abstractmethod
     def values(self, t: Array) -> Array:
         """Return value, rate and acceleration, shape (3, len(t))."""
-        raise NotImplementedError
 
+    @abstractmethod
     def errors(self, t: Array, gains: Array) -> Array:
         """Return errors of sums of gains (3, m, r) times value, rate and acceleration at times (m,).
 
@@ -46,7 +53,6 @@ class SmoothFit(Immutable, frozen=True):
         (r, any) array
             Factors of independent errors of variance 1.
         """
-        raise NotImplementedError
 
 
 def describe_errors(variance: Callable[[Array, int], Array], t: Array) -> tuple[Array, Array]:
