@@ -221,11 +221,16 @@ def test_a_small_pivot_falls_back_to_projection():
         np.testing.assert_array_equal(eliminating.dae_acceleration(*state), projecting.dae_acceleration(*state))
 
 
-def test_dependent_rows_are_detected():
-    """The squares stand upright, where the loops lose rank."""
+def flat_squares():
+    """Return three squares in a row, and their configuration where the rods lie flat and the loops lose rank."""
     mechanism = build(*generate(GeneratorSpec(generator="n_four_bar", N=3)))
+    turn = np.where(np.arange(mechanism.n) <= 3, -np.pi / 2, np.pi / 2)
+    return mechanism, mechanism.tree.integrate(mechanism.q_tree, turn)
+
+
+def test_dependent_rows_are_detected():
+    mechanism, flat = flat_squares()
     n = mechanism.n
-    flat = mechanism.tree.integrate(mechanism.q_tree, np.where(np.arange(n) <= 3, -np.pi / 2, np.pi / 2))
     for elimination in [kind(core_table(mechanism)) for kind in ELIMINATIONS]:
         assert elimination.acceleration(mechanism.q_tree, np.zeros(n), np.zeros(n)) is not None
         assert elimination.acceleration(flat, np.zeros(n), np.zeros(n)) is None
@@ -234,9 +239,8 @@ def test_dependent_rows_are_detected():
 @pytest.mark.parametrize("elimination", ELIMINATIONS)
 def test_loops_stay_closed_near_a_loss_of_rank(elimination):
     """Without refinement J a differs from -J_dot v by up to 7e-14 of its terms."""
-    mechanism = build(*generate(GeneratorSpec(generator="n_four_bar", N=3)))
+    mechanism, flat = flat_squares()
     n, random, worst = mechanism.n, np.random.default_rng(6), 0.0
-    flat = mechanism.tree.integrate(mechanism.q_tree, np.where(np.arange(n) <= 3, -np.pi / 2, np.pi / 2))
     eliminated = elimination(core_table(mechanism))
     for _ in range(20):
         at = mechanism.kinematics(mechanism.tree.integrate(flat, 1e-3 * random.uniform(-1, 1, n)))
