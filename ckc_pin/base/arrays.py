@@ -49,7 +49,7 @@ class lazy(Generic[T]):
 class Immutable(msgspec.Struct, frozen=True, eq=False):
     """Base of immutable structures whose arrays are read-only. A deep copy shares them.
 
-    Structures, because Python 3.11 takes 0.5 ms to create a data class, and a command imports dozens of them.
+    They are no data classes, because Python 3.11 takes 0.5 ms to define one, and a command imports dozens of them.
     """
 
     def __post_init__(self) -> None:

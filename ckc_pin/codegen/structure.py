@@ -50,7 +50,7 @@ def structure_key(mechanism: Mechanism, which: Mapping[str, BoolArray]) -> str:
 
 
 def _constants(group: Any) -> dict[str, Any]:
-    """Return the attributes of a group of rows that are written into the code as constants."""
+    """Return the attributes of a group of constraint rows that compiled terms contain as constants."""
     is_relative, is_curve = isinstance(group, RelativeLog), isinstance(group, Curved)
     return {
         name: np.asarray(getattr(group, name)).tolist()

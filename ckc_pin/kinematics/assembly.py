@@ -135,7 +135,7 @@ def reassemble(mechanism: Mechanism, overrides: Overrides, at: Kinematics) -> tu
 
 
 def _size(linkage: Linkage) -> int:
-    """Return the size of the largest matrix of an assembly, that of eq. 1."""
+    """Return a bound of the numbers of rows and columns of all matrices in an assembly."""
     return linkage.tree.n + linkage.closure.rows
 
 

@@ -70,7 +70,7 @@ def _joined(parts: list[T]) -> T:
 
 
 def _by_field(values: T, combine: Callable[[list[Array]], Array], parts: Sequence[T]) -> dict[str, Any]:
-    """Return the attributes of structures combined, also those that are tuples of arrays."""
+    """Combine the arrays of each attribute of several structures; an attribute may be a tuple of arrays."""
     result: dict[str, Any] = {}
     for name in values.__struct_fields__:
         of_parts = [getattr(part, name) for part in parts]

@@ -13,7 +13,8 @@ namespace ckc {
 
 constexpr int block_size = ArticulatedBodies::block_size;
 using Places = std::vector<std::pair<int, int>>;
-// Of a row, relative to the sum of the magnitudes of its terms; each product and sum is rounded by up to a quarter of it.
+// A residual of up to this, relative to the sum of the magnitudes of a row's terms, is rounding, which a refinement
+// cannot reduce.
 constexpr double max_residual = 2 * std::numeric_limits<double>::epsilon();
 
 static const Vector8& row_of(const double* block, int place) {
